@@ -40,7 +40,7 @@ from demos import scene
 from tfeti_dolfinx.feti.preconditioner import PARAMETERS
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import Point, Steps, StoppingRule, homogenise
-from tfeti_dolfinx.qp.sets import Status, face_of
+from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
 # as ranks.c has them
@@ -86,7 +86,7 @@ def sent_by_steps(dual, sent):
     """What a step of conjugate gradients sends on a face without half of the contact rows."""
     free = np.ones(dual.constraints.num_rows, dtype=bool)
     free[dual.constraints.sets.normals[::2]] = False
-    face, qp = face_of(free, np.where(free, Status.TOUCHING, Status.OPEN)), dual.qp()
+    face, qp = Face(free, np.where(free, Status.TOUCHING, Status.OPEN)), dual.qp()
     preconditioner = qp.preconditioner_on(face)
     qp = replace(qp, coarse=qp.coarse.on_face(face), preconditioner=preconditioner)
     start, found = homogenise(qp), []

@@ -14,7 +14,7 @@ from tfeti_dolfinx.common.parallel import dot_over, norm_over
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, StoppingRule
-from tfeti_dolfinx.qp.sets import Face, Product, Status, face_of
+from tfeti_dolfinx.qp.sets import Face, Product, Status
 
 
 def in_a_corner(**options):
@@ -45,7 +45,7 @@ def mask(dual, kept):
     free = np.ones(dual.constraints.num_rows, dtype=bool)
     bounded = np.arange(len(free))[dual.constraints.sets.normals]
     free[bounded] = kept(bounded)
-    return face_of(free, np.where(free, Status.TOUCHING, Status.OPEN))
+    return Face(free, np.where(free, Status.TOUCHING, Status.OPEN))
 
 
 def sliding(dual):

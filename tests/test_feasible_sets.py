@@ -10,7 +10,7 @@ from test_discs import discs
 
 from tfeti_dolfinx import InputError
 from tfeti_dolfinx.errors import ConformanceError
-from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, Product, Status, face_of
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, Product, Status
 from tfeti_dolfinx.testing import check_feasible_set
 
 pytestmark = pytest.mark.usefixtures("serial_only")
@@ -92,17 +92,17 @@ class WrongSign(Bounds):
 
 class FaceWithOpenRows(Bounds):
     def face(self, x, g):
-        return face_of(np.ones(len(x), dtype=bool), super().face(x, g).status)
+        return Face(np.ones(len(x), dtype=bool), super().face(x, g).status)
 
 
 class AllTouching(Bounds):
     def face(self, x, g):
-        return face_of(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING))
+        return Face(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING))
 
 
 class Missing(Bounds):
     def face(self, x, g):
-        return face_of(np.zeros(len(x), dtype=bool), super().face(x, g).status)
+        return Face(np.zeros(len(x), dtype=bool), super().face(x, g).status)
 
 
 class Scaled(Bounds):

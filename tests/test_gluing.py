@@ -23,7 +23,8 @@ class Scene:
         self.bcs = []
         if clamped:
             self.bcs = [clamp(V, d.facets("left"), np.arange(1.0, gdim + 1))]
-        records = concatenate([c.records(dofs, i) for i, c in enumerate(contacts)], gdim)
+        found = [c.records(dofs, i, np.inf, np.inf) for i, c in enumerate(contacts)]
+        records = concatenate(found, gdim)
         n_local = dofs.num_nodes * dofs.bs
         self.weights = np.ones(n_local) if weights is None else weights(dofs)
         self.gluing = glue(dofs, prescribe(dofs, self.bcs), records, 1.0, self.weights)
@@ -147,7 +148,7 @@ def test_prescribed_components_move_into_the_gap():
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
     dofs = TornDofs(V, d)
     bottom = fem.locate_dofs_topological(V.sub(0), 2, d.facets("bottom"))
-    records = concatenate([slanted.records(dofs, 0)], 3)
+    records = concatenate([slanted.records(dofs, 0, np.inf, np.inf)], 3)
     bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]
     gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
     rows = gluing.constraints.sets.normals

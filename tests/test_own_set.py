@@ -5,7 +5,7 @@ import pytest
 from scenes import curved_obstacle, decomposed, problem
 
 from tfeti_dolfinx import Extensions, Obstacle
-from tfeti_dolfinx.qp.sets import Product, Status, face_of
+from tfeti_dolfinx.qp.sets import Face, Product, Status
 from tfeti_dolfinx.testing import check_feasible_set
 
 
@@ -29,7 +29,7 @@ class HalfSpaces:
 
     def face(self, x, g):
         off = ~self._bound(x)
-        return face_of(off, np.where(off, Status.TOUCHING, Status.OPEN))
+        return Face(off, np.where(off, Status.TOUCHING, Status.OPEN))
 
     def onto(self, x, status):
         return np.where(status == Status.OPEN, self.b / self.a, self.project(x))

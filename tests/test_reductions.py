@@ -12,7 +12,7 @@ from test_solvable_lp import dual_of
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps, StoppingRule, homogenise
-from tfeti_dolfinx.qp.sets import Status, face_of
+from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 
 COLLECTIVE = ("allreduce", "Allreduce", "reduce", "Reduce", "bcast", "Bcast", "allgather", "gather")
@@ -44,7 +44,7 @@ def dual():
 def face_with_half_of_the_contacts(dual):
     free = np.ones(dual.constraints.num_rows, dtype=bool)
     free[dual.constraints.sets.normals[::2]] = False
-    return face_of(free, np.where(free, Status.TOUCHING, Status.OPEN))
+    return Face(free, np.where(free, Status.TOUCHING, Status.OPEN))
 
 
 def count(qp, num_steps):

@@ -7,7 +7,7 @@ from scenes import curved_obstacle, decomposed, displacement, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.parallel import dot_over
-from tfeti_dolfinx.qp.sets import Status, face_of
+from tfeti_dolfinx.qp.sets import Face, Status
 
 SUBDOMAINS = 8
 
@@ -96,7 +96,7 @@ def test_the_preconditioner_is_symmetric_and_positive(held):
     free = np.ones(dual.constraints.num_rows, dtype=bool)
     free[rows] = held
     status = np.where(free, Status.TOUCHING, Status.OPEN)
-    M, vectors = dual.qp().preconditioner_on(face_of(free, status)), []
+    M, vectors = dual.qp().preconditioner_on(Face(free, status)), []
     for seed in range(2):
         x = np.where(free, np.random.default_rng(seed).standard_normal(len(free)), 0.0)
         vectors.append((x, M(x)))

@@ -37,6 +37,7 @@ from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checke
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
+from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.report import Outcome, Report, SolverCounts, largest_over_ranks
 from tfeti_dolfinx.saved_state import SavedState, check_state
 from tfeti_dolfinx.solution import Solution
@@ -519,7 +520,9 @@ class ContactProblem:
         if dual.recycled is not None:
             dual.recycled.take(state.directions)
         dual.last.take(self.dofs.comm, state.lam, state.image)
-        solution = self._make_solution(state.u, state.multipliers(), gluing)
+        # a face that only knows what rows do
+        face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
+        solution = self._make_solution(state.u, Multipliers(state.lam, face), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
         known = solution.gluing.records, solution.slip_at_end

@@ -13,12 +13,11 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type
-from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.qp.sets import Status, face_of
+from tfeti_dolfinx.qp.sets import Status
 from tfeti_dolfinx.solution import Solution
 
 # --- Labels: the same on any number of ranks --------------------------------------------------
@@ -338,10 +337,6 @@ class SavedState:
         order = np.argsort(of_groups)
         own = order[np.searchsorted(of_groups, self.group, sorter=order)]
         return [own[self.reached & (self.contact == i)] for i in range(len(self.reach))]
-
-    def multipliers(self) -> Multipliers:
-        """Return the multipliers, with a face that only knows what rows do."""
-        return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
 
     def common(self) -> dict[str, Any]:
         """Return what all ranks' states must share, since searches and solves depend on it."""

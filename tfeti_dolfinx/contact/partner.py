@@ -72,13 +72,7 @@ class ContactPartner:
         """Names or tags of the surfaces, that with the multipliers first."""
         raise NotImplementedError
 
-    def records(
-        self,
-        dofs: TornDofs,
-        contact: int,
-        reach: float = np.inf,
-        depth: float = np.inf,
-    ) -> ContactRecords:
+    def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
         """Return the conditions.
 
         Args:
@@ -273,13 +267,7 @@ class Obstacle(ContactPartner):
         """The surface."""
         return (self.surface,)
 
-    def records(
-        self,
-        dofs: TornDofs,
-        contact: int,
-        reach: float = np.inf,
-        depth: float = np.inf,
-    ) -> ContactRecords:
+    def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective.
 
         With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex (or the gap that is
@@ -428,13 +416,7 @@ class Contact(ContactPartner):
             log.warning(EDGES, self.name, settled.a)
         return settled, found
 
-    def records(
-        self,
-        dofs: TornDofs,
-        contact: int,
-        reach: float = np.inf,
-        depth: float = np.inf,
-    ) -> ContactRecords:
+    def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
         """One condition per node of ``a`` that faces ``b``. Collective.
 
         With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is

@@ -41,7 +41,6 @@ from tfeti_dolfinx.qp.sets import (
     FeasibleSet,
     Product,
     Status,
-    face_of,
 )
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -310,7 +309,7 @@ class Dual:
             return self.preconditioner
         if self._on_all is None:
             rows = self.constraints.num_rows
-            face = face_of(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
+            face = Face(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
             self._on_all = self._made_on(face)
         return self._on_all
 

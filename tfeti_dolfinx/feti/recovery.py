@@ -10,7 +10,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.qp.sets import Face, face_of
+from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
@@ -70,7 +70,7 @@ def recover(
         alpha = coarse.solve(coarse.G(residual - np.where(held, 0.0, gradient)))
         if any_rank(coarse.comm, not np.all(held)):
             left = np.where(held, residual - coarse.rows @ alpha, 0.0)
-            on_held = face_of(held, face.status)
+            on_held = Face(held, face.status)
             alpha = alpha + coarse.damped_solve(on_held, coarse.G(left), damping)
         u = u + coarse.kernel_motion(alpha)
     gap = residual - coarse.Gt @ alpha

@@ -64,10 +64,6 @@ class Motion:
         """u + τv."""
         return self.u + self.size * self.v
 
-    def velocity(self, u: Array) -> Array:
-        """v⁺ where the step ends at u."""
-        return self.start + 2.0 / self.size * (u - self.towards)
-
 
 class Inertia:
     """Mass of the bodies, and where a time step begins. Creation and all methods are collective.

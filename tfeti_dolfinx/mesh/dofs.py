@@ -124,6 +124,9 @@ class TornDofs:
     Attributes:
         decomposition: The torn mesh.
         bs: Unknowns per node.
+        num_nodes: Primal nodes of this rank, n.
+        num_groups: Groups owned by this rank, g.
+        multiplicity: Number of copies in each owned group, shape ``(g,)``.
         subdomains: Subdomains of this rank, ascending, shape ``(S,)``.
         node_offsets: First primal node of each subdomain, shape ``(S + 1,)``.
         dolfinx_node: DOLFINx's node for each primal node, shape ``(n,)``.
@@ -142,32 +145,17 @@ class TornDofs:
     def __init__(self, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
         check_space(V, decomposition)
         self.V, self.decomposition, self.comm = V, decomposition, decomposition.comm
-        self.bs = V.dofmap.index_map_bs
+        self.bs, self.num_nodes = V.dofmap.index_map_bs, V.dofmap.index_map.size_local
         self._number_nodes(decomposition)
         self.nodes: Array | None = None
         self.offsets = chunk_offsets(self.comm, self.num_nodes)
         origin, key = node_keys(V, decomposition)
         self._find_groups(decomposition, origin[self.dolfinx_node], key[self.dolfinx_node])
 
-    @property
-    def num_nodes(self) -> int:
-        """Primal nodes of this rank."""
-        return len(self.dolfinx_node)
-
     def points(self) -> Array:
         """Return the place of each primal node, shape ``(n, 3)``."""
         x = self.V.tabulate_dof_coordinates() if self.nodes is None else self.nodes
         return np.asarray(x[self.dolfinx_node])
-
-    @property
-    def num_groups(self) -> int:
-        """Groups owned by this rank."""
-        return len(self.copy_offsets) - 1
-
-    @property
-    def multiplicity(self) -> Array:
-        """Number of copies in each owned group, shape ``(g,)``."""
-        return np.diff(self.copy_offsets)
 
     def to_primal(self, values: Array) -> Array:
         """Unrolled dof values from DOLFINx's order to primal order, shape ``(n * bs,)``."""
@@ -261,15 +249,14 @@ class TornDofs:
     def _number_nodes(self, decomposition: Decomposition) -> None:
         """Sort nodes by subdomain, keeping DOLFINx's order within each."""
         cells = np.asarray(self.V.dofmap.list)
-        num_nodes = self.V.dofmap.index_map.size_local
-        subdomain = np.empty(num_nodes, dtype=np.int64)
+        subdomain = np.empty(self.num_nodes, dtype=np.int64)
         subdomain[cells] = decomposition.cell_subdomain[:, None]
         self.dolfinx_node = np.argsort(subdomain, kind="stable")
         self._primal_node = np.empty_like(self.dolfinx_node)
-        self._primal_node[self.dolfinx_node] = np.arange(num_nodes)
+        self._primal_node[self.dolfinx_node] = np.arange(self.num_nodes)
         self.subdomains = decomposition.subdomains
         in_order = subdomain[self.dolfinx_node]
-        self.node_offsets = np.append(np.searchsorted(in_order, self.subdomains), num_nodes)
+        self.node_offsets = np.append(np.searchsorted(in_order, self.subdomains), self.num_nodes)
         self.node_subdomain = in_order
 
     def _find_groups(self, decomposition: Decomposition, origin: Array, key: Array) -> None:
@@ -303,6 +290,8 @@ class TornDofs:
         slot[order] = np.cumsum(first) - 1
         self.copies, self.copy_subdomains = node[order], subdomain[order]
         self.copy_offsets = np.append(np.flatnonzero(first), len(order))
+        self.multiplicity = np.diff(self.copy_offsets)
+        self.num_groups = len(self.multiplicity)
         self._to_owner, self._to_owner_slot, self._copy_order = exchange, slot, order
         self.group_offsets = chunk_offsets(self.comm, self.num_groups)
         self.group = exchange.answer(self.group_offsets[self.comm.rank] + slot)

@@ -172,7 +172,7 @@ class _Return:
         self.share = 1.0 - 3.0 * mu * self.dp / q
         self.regular = hardening.regularisation * (self.dp > 0.0)
         self.n, self.q, self.s = 1.5 * s / q[:, None], q, s
-        self.tau = self._turned_back(np.eye(3) * (self.share[:, None] * s)[:, None, :])
+        self.tau = (self.axes * (self.share[:, None] * s)[:, None, :]) @ _transposed(self.axes)
 
     def stress(self) -> Array:
         """Return P = τ F⁻ᵀ, shape (n, 3, 3), without its volumetric part."""
@@ -192,7 +192,7 @@ class _Return:
             d_tau = shear * db
             strains = np.einsum("naa->na", db) / (2.0 * self.b)
             d_tau[:, range(3), range(3)] = np.einsum("nab,nb->na", diagonal, strains)
-            dP = self._turned_back(d_tau) @ _transposed(self.F_inverse)
+            dP = self.axes @ d_tau @ turned @ _transposed(self.F_inverse)
             # δ(F⁻ᵀ) = −F⁻ᵀ δFᵀ F⁻ᵀ
             dP -= P[:, :, j, None] * self.F_inverse[:, None, :, i]
             found[:, :, k] = dP[:, rows, columns]
@@ -235,14 +235,10 @@ class _Return:
     def end(self) -> tuple[Array, Array]:
         """Return C_p⁻¹ and p at the end of the load step, as arrays of their functions."""
         elastic = np.exp(2.0 * (self.strain - self.dp[:, None] * self.n))
-        b = self._turned_back(np.eye(3) * elastic[:, None, :])
+        b = (self.axes * elastic[:, None, :]) @ _transposed(self.axes)
         new = self.F_inverse @ b @ _transposed(self.F_inverse)
         rows, columns = np.array(SYMMETRIC).T
         return new[:, rows, columns].ravel(), self.p + self.dp
-
-    def _turned_back(self, t: Array) -> Array:
-        """Return tensors given in principal axes."""
-        return np.asarray(self.axes @ t @ _transposed(self.axes))
 
 
 def _transposed(t: Array) -> Array:

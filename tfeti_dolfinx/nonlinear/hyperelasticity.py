@@ -50,6 +50,8 @@ class Hyperelasticity(ABC):
     ) -> None:
         check_law(elasticity, u, type(self).__name__)
         self.elasticity, self.u = elasticity, u
+        E, nu = elasticity.E, elasticity.nu
+        self._lmbda = E * nu / (1 + nu) / (1 - 2 * nu)
         self.definite = checked_number(definite, "definite", POSITIVE)
         self._at = Quadrature.of(u, degree, selective)
         self.dx = self._at.dx
@@ -57,12 +59,8 @@ class Hyperelasticity(ABC):
         self.update()
 
     @abstractmethod
-    def volumetric_energy(self, F: Any) -> Any:
-        """Return the energy per volume by which the body resists changes of its volume alone."""
-
-    @abstractmethod
-    def shape_energy(self, F: Any) -> Any:
-        """Return the rest of the energy per volume."""
+    def energies(self, F: Any) -> tuple[Any, Any]:
+        """Return the energy per volume by which changes of volume are resisted, and the rest."""
 
     @abstractmethod
     def missing(self, F: Any) -> Any:
@@ -79,14 +77,15 @@ class Hyperelasticity(ABC):
     def stress(self, u: Any) -> Any:
         """Return Cauchy's stress P Fᵀ/det F, 3×3."""
         F = ufl.variable(self.deformation(u))
-        P = ufl.diff(self.volumetric_energy(F) + self.shape_energy(F), F)
+        of_volume, of_shape = self.energies(F)
+        P = ufl.diff(of_volume + of_shape, F)
         return P * F.T / ufl.det(F)
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫P(u):∇v, P = ∂ψ/∂F, with a tangent that is definite on stretches."""
         thickness, F = self.elasticity.thickness, self.deformation(self.u)
-        energy = thickness * self.shape_energy(F) * self.dx
-        energy += thickness * self.volumetric_energy(F) * self._at.dx_volume
+        of_volume, of_shape = self.energies(F)
+        energy = thickness * of_shape * self.dx + thickness * of_volume * self._at.dx_volume
         here = self.deformation(self._here)
         inverse = ufl.inv(here)
         rate = ufl.sym((F - here) * inverse)
@@ -102,17 +101,15 @@ class NeoHooke(Hyperelasticity):
     Arguments are those of ``Hyperelasticity``.
     """
 
-    def volumetric_energy(self, F: Any) -> Any:
-        """Return λ/2 ln²J."""
-        return first_lame(self.elasticity) / 2 * ufl.ln(ufl.det(F)) ** 2
-
-    def shape_energy(self, F: Any) -> Any:
-        """Return μ/2 (tr FᵀF − 3 − 2 ln J)."""
-        return self.elasticity.mu * (0.5 * (ufl.inner(F, F) - 3) - ufl.ln(ufl.det(F)))
+    def energies(self, F: Any) -> tuple[Any, Any]:
+        """Return λ/2 ln²J and μ/2 (tr FᵀF − 3 − 2 ln J)."""
+        J = ufl.det(F)
+        of_shape = self.elasticity.mu * (0.5 * (ufl.inner(F, F) - 3) - ufl.ln(J))
+        return self._lmbda / 2 * ufl.ln(J) ** 2, of_shape
 
     def missing(self, F: Any) -> Any:
         """Bound e : c : e + e τ : e ≥ (μ − λ ln J + μ b) e : e, b the least eigenvalue of FFᵀ."""
-        mu, lmbda = self.elasticity.mu, first_lame(self.elasticity)
+        mu, lmbda = self.elasticity.mu, self._lmbda
         least = mu * (1 + principal_squares(F)[0]) - lmbda * ufl.ln(ufl.det(F))
         return ufl.max_value(self.definite * mu - least, 0.0) / 2
 
@@ -124,18 +121,15 @@ class SaintVenantKirchhoff(Hyperelasticity):
     softer, and unstable. Arguments are those of ``Hyperelasticity``.
     """
 
-    def volumetric_energy(self, F: Any) -> Any:
-        """Return λ/2 tr²E."""
-        return first_lame(self.elasticity) / 8 * (ufl.inner(F, F) - 3) ** 2
-
-    def shape_energy(self, F: Any) -> Any:
-        """Return μ E : E."""
+    def energies(self, F: Any) -> tuple[Any, Any]:
+        """Return λ/2 tr²E and μ E : E."""
         E = 0.5 * (F.T * F - ufl.Identity(3))
-        return self.elasticity.mu * ufl.inner(E, E)
+        of_volume = self._lmbda / 8 * (ufl.inner(F, F) - 3) ** 2
+        return of_volume, self.elasticity.mu * ufl.inner(E, E)
 
     def missing(self, F: Any) -> Any:
         """Bound e : c : e ≥ 2μ b² e : e, b the least eigenvalue of FFᵀ, and e τ : e by τ's."""
-        mu, lmbda, values = self.elasticity.mu, first_lame(self.elasticity), principal_squares(F)
+        mu, lmbda, values = self.elasticity.mu, self._lmbda, principal_squares(F)
         pressure = lmbda / 2 * (ufl.inner(F, F) - 3)
         taus = [b * (pressure + mu * (b - 1)) for b in values]
         tau = ufl.min_value(taus[0], ufl.min_value(taus[1], taus[2]))
@@ -149,12 +143,6 @@ def displacement_gradient(elasticity: Elasticity, u: Any) -> Any:
         return g
     across = elasticity.strain(u)[2, 2]
     return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, across]])
-
-
-def first_lame(elasticity: Elasticity) -> Any:
-    """Return λ = Eν/((1 + ν)(1 − 2ν))."""
-    E, nu = elasticity.E, elasticity.nu
-    return E * nu / (1 + nu) / (1 - 2 * nu)
 
 
 def principal_squares(F: Any) -> tuple[Any, Any, Any]:

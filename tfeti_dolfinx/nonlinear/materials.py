@@ -199,6 +199,7 @@ class Plasticity(ABC):
     ) -> None:
         check_law(elasticity, u, type(self).__name__)
         self.elasticity, self.u = elasticity, u
+        self._bulk = elasticity.E / 3 / (1 - 2 * elasticity.nu)
         values = zip(HARDENING.items(), (yield_stress, hardening, saturation, rate), strict=True)
         self.given = {
             name: in_ufl(value, elasticity.on, name, expected) for (name, expected), value in values
@@ -241,10 +242,6 @@ class Plasticity(ABC):
         given = self.given
         hardens = given["hardening"] + given["saturation"] * given["rate"]
         return ufl.conditional(ufl.gt(hardens, 0.0), 0.0, self._tolerances.perfect)
-
-    @property
-    def _bulk(self) -> Any:
-        return self.elasticity.E / 3 / (1 - 2 * self.elasticity.nu)
 
 
 class J2Plasticity(Plasticity):
@@ -294,9 +291,11 @@ class J2Plasticity(Plasticity):
         s = self._trial(u)
         self._q_of_u = fem.Expression(ufl.sqrt(1.5 * ufl.inner(s, s)), points)
         self._G_of_x = fem.Expression(elasticity.mu, points)
-        self._n = self._normal(u)
+        self._n = 1.5 * s / self._norm(u)  # direction of plastic flow
         new = self._tensor(self.plastic_strain) + self._dp * self._n
-        values = {self.plastic_strain: _components(new, self._gdim), self.p: self.p + self._dp}
+        places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+        components = [new[i, j] for i, j in places[: 6 if self._gdim == 3 else 4]]
+        values = {self.plastic_strain: ufl.as_vector(components), self.p: self.p + self._dp}
         self.state = LawVariables(self, values)
 
     def update(self) -> None:
@@ -349,10 +348,6 @@ class J2Plasticity(Plasticity):
         tiny = (self.given["yield_stress"] * self._tolerances.yielding) ** 2
         return ufl.sqrt(1.5 * ufl.inner(s, s) + tiny)
 
-    def _normal(self, u: Any) -> Any:
-        """Direction of plastic flow, 3 s/2 q."""
-        return 1.5 * self._trial(u) / self._norm(u)
-
     def _tensor(self, c: Any) -> Any:
         """Return 3×3 tensors from their components."""
         if self._gdim == 3:
@@ -389,9 +384,3 @@ def check_return(solved: bool, hardening: IsotropicHardening) -> None:
             f"J2 plasticity: the return takes more than {hardening.tolerances.max_it} steps "
             "somewhere"
         )
-
-
-def _components(t: Any, gdim: int) -> Any:
-    """Return the components of symmetric 3×3 tensors."""
-    places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
-    return ufl.as_vector([t[i, j] for i, j in places[: 6 if gdim == 3 else 4]])

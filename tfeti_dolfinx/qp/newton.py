@@ -29,7 +29,7 @@ from tfeti_dolfinx.qp.projection import (
     WithinFace,
     project_onto_feasible,
 )
-from tfeti_dolfinx.qp.sets import Face, Status, face_of
+from tfeti_dolfinx.qp.sets import Face, Status
 
 # least status of rows with friction
 RUBS = Status.STICK
@@ -157,7 +157,7 @@ def multipliers_at(qp: QP, z: Point) -> Array:
     """
     face = qp.feasible.face(z.lam, -z.lam)
     holds = (face.status == Status.FREE) | (face.holding & (z.lam != 0.0))
-    coarse = qp.coarse.on_face(face_of(holds, face.status))
+    coarse = qp.coarse.on_face(Face(holds, face.status))
     return coarse.coordinates(z.g)
 
 

@@ -132,16 +132,6 @@ class Face:
         return same and np.array_equal(self.free, other.free)
 
 
-def face_of(free: Array, status: Array) -> Face:
-    """Return a flat face whose directions are coordinates.
-
-    Args:
-        free: Flags of the rows that may move, shape ``(m,)``.
-        status: Status of each row.
-    """
-    return Face(np.array(free, dtype=bool), status)
-
-
 # --- Feasible sets ----------------------------------------------------------------------------
 # A set knows its own rows of this rank as numpy arrays, nothing of ranks and other rows: solvers
 # add up over ranks, ``Product`` puts sets on rows. Nothing here is collective.

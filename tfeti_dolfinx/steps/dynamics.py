@@ -398,7 +398,9 @@ class ContactDynamics(ContactProblem):
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
         solution = super()._make_solution(u, multipliers, gluing)
-        solution.v = self._forms_in_time.inertia.motion.velocity(self.dofs.to_dolfinx(u))
+        motion = self._forms_in_time.inertia.motion
+        way = self.dofs.to_dolfinx(u) - motion.towards
+        solution.v = motion.start + 2.0 / motion.size * way
         return solution
 
     def _predicted(self, predictor: Predictor, free: Array) -> Array:
