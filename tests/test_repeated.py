@@ -121,7 +121,7 @@ def test_other_data_make_what_depends_on_them_alone(scene):
     assert report.factorizations > 0
     assert distance(third, scene.fresh(E=2.0)) <= 1e-8
     assert (report.in_all["solves"], report.in_all["searches"]) == (3, 1)
-    assert len(set(scene.problem.decomposition.comm.allgather(report.to_json()))) == 1
+    assert len(set(scene.problem.decomposition.comm.allgather(report.details()))) == 1
     scene.problem.destroy()
     assert distance(scene.solve(), first) <= 1e-9
 

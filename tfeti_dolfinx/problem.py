@@ -352,7 +352,8 @@ class ContactProblem:
         """
         self._meet("estimate")
         found = estimate(self._system, self.solution)
-        self.report.take(with_estimates(self.report, found.numbers()))
+        known = {name: value for name, value in vars(found).items() if value is not None}
+        self.report.take(with_estimates(self.report, known))
         return found
 
     def update(

@@ -376,10 +376,6 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
                 lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
         return "\n".join(lines)
 
-    def to_json(self) -> str:
-        """Return the report as JSON."""
-        return json.dumps(asdict(self), indent=2)
-
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
         """Write the report as a JSON file; it appears whole. Collective.
 
@@ -389,7 +385,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
             if comm.rank == 0:
                 with written_whole(Path(path)) as partial:
-                    partial.write_text(self.to_json() + "\n")
+                    partial.write_text(json.dumps(asdict(self), indent=2) + "\n")
 
 
 def _item(item: str | list[float] | dict[str, Any]) -> str:

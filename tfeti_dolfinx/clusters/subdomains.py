@@ -475,10 +475,6 @@ class ClusteredSubdomains(Subdomains):
         allowed = abs(self.null).T @ np.repeat(sizes, counts)
         return np.where(np.abs(part) > ROUNDING.balanced * allowed, part, 0.0)
 
-    def kernel_part(self, b: Array) -> Array:
-        """R̃ᵀb, shape ``(r̃,)``, for b on all unknowns, shape ``(n,)``."""
-        return np.asarray(self.null.T @ super().kernel_part(b))
-
     def kernel_motion(self, alpha: Array) -> Array:
         """R̃α on all unknowns, shape ``(n,)``, for α of shape ``(r̃,)``."""
         return super().kernel_motion(self.null @ alpha)
@@ -514,7 +510,9 @@ class ClusteredSubdomains(Subdomains):
         B, glue, b = self._clusters.averages, self._glue(), np.array(b)
         b[self.trace] = glue.beside(b[self.trace])
         x = super().solve(b)
-        z = glue.apply(np.concatenate((B @ x, -super().kernel_part(b))))
+        pairs = zip(self.blocks, self.dof_parts, strict=True)
+        in_kernels = [-(block.kernel.T @ b[part]) for block, part in pairs]
+        z = glue.apply(np.concatenate((B @ x, *in_kernels)))
         mu, alpha = z[: B.shape[0]], z[B.shape[0] :]
         x = np.asarray(x - super().solve(B.T @ mu) + super().kernel_motion(alpha))
         x[self.trace] = glue.beside(x[self.trace])

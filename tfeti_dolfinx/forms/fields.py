@@ -13,7 +13,6 @@ from ufl.algorithms.analysis import extract_arguments, extract_coefficients, ext
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import JIT_OPTIONS, interpolation_points
-from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.common.validation import POSITIVE, checked_callable, checked_number, named, shown
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.forms.checks import check_mesh, check_not_negative
@@ -241,11 +240,6 @@ class StressRecovery:
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree + 1})
         density = thickness * ufl.inner(stress, strain) * ufl.TestFunction(self.cells)
         self._form = fem.form(density * dx, jit_options=JIT_OPTIONS)
-
-    def error(self) -> float:
-        """Return the estimate for all bodies, a root of an energy; the same on all ranks."""
-        comm = self._dofs.comm
-        return float(np.sqrt(bcast_from_root(comm, comm.allreduce(float(self.squares().sum())))))
 
     def squares(self) -> Array:
         """∫(σ* − σ_h) : (ε* − ε_h) over each local cell, shape ``(cells,)``."""

@@ -208,11 +208,6 @@ class Subdomains:
             parts.append(np.where(moves, part, 0.0))
         return joined(parts)
 
-    def kernel_part(self, b: Array) -> Array:
-        """Rᵀ b, shape ``(r,)``, for b on all unknowns, shape ``(n,)``."""
-        pairs = zip(self.blocks, self.dof_parts, strict=True)
-        return joined([block.kernel.T @ b[part] for block, part in pairs])
-
     def kernel_motion(self, alpha: Array) -> Array:
         """R α on all unknowns, shape ``(n,)``, for α of shape ``(r,)``."""
         pairs = zip(self.blocks, self.kernel_parts, strict=True)
