@@ -38,7 +38,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.qp.sets import Face
-from tfeti_dolfinx.report import Outcome, Report, SolverCounts, largest_over_ranks
+from tfeti_dolfinx.report import Outcome, Report, SolverCounts, added, largest_over_ranks
 from tfeti_dolfinx.saved_state import SavedState, check_state
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
@@ -241,19 +241,19 @@ class ContactProblem:
                 solution, overlap = self._solve_rows()
             except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
                 with stage("contact", self._seconds):
-                    added = system.search.widen()
-                if added == 0:
+                    new = system.search.widen()
+                if new == 0:
                     if unmet := system.search.unmet():
                         text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
                         raise NoSolutionError(text) from error
                     raise
             else:
                 with stage("contact", self._seconds):
-                    added = system.search.take_in_overlapping(solution.u, overlap)
-                if added == 0:
+                    new = system.search.take_in_overlapping(solution.u, overlap)
+                if new == 0:
                     return
             system.change("rows")
-            self._counts = self._counts.plus(SolverCounts(late_contact_rows=added))
+            self._counts.late_contact_rows += new
         raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
 
     def _solve_rows(self) -> tuple[Solution, float]:
@@ -288,7 +288,8 @@ class ContactProblem:
         end = gluing, solution.lam, result.mu, system.inverses
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
-        self._counts = self._counts.plus(SolverCounts.of_run(dual, *solved))
+        counts = SolverCounts.of_run(dual, *solved)
+        self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
         excluding = system.search.named(gluing.contacts_of(result.excluding))
         state, loose = accuracy.recovered, list[dict[str, object]]()
         if options.warnings and state is not None:

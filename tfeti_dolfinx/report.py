@@ -130,10 +130,6 @@ class SolverCounts:
             soft_factorizations=0 if soft is None else soft.factors.count["face"],
         )
 
-    def plus(self, other: SolverCounts) -> SolverCounts:
-        """Return the sums of counts."""
-        return SolverCounts(**added(vars(self), vars(other)))
-
 
 @dataclass
 class ContactSummary:

@@ -70,12 +70,6 @@ def labels_of_function(f: fem.Function, decomposition: Decomposition) -> Array:
     return labels_of_dofs(np.asarray(V.dofmap.list), count, decomposition)
 
 
-def labels_of_points(decomposition: Decomposition) -> Array:
-    """Return labels of the points of the torn mesh."""
-    mesh = decomposition.mesh
-    return labels_of_dofs(geometry_dofmap(mesh), len(mesh.geometry.x), decomposition)
-
-
 def labels_of_nodes(dofs: TornDofs) -> Array:
     """Return labels of primal nodes."""
     cells = dofs.primal_nodes(np.asarray(dofs.V.dofmap.list).ravel())

@@ -11,7 +11,13 @@ from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange, offset_of
-from tfeti_dolfinx.mesh.untorn import UntornMesh, equal_pairs, exchange_by_key, facet_vertices
+from tfeti_dolfinx.mesh.untorn import (
+    UntornMesh,
+    equal_pairs,
+    exchange_by_key,
+    facet_keys,
+    facet_vertices,
+)
 
 
 @dataclass(frozen=True)
@@ -57,10 +63,10 @@ class CellGraph:
 
     def __init__(self, mesh: UntornMesh, comm: MPI.Intracomm) -> None:
         self.comm, self.num_cells, self.num_nodes = comm, len(mesh.cells), len(mesh.node_ids)
-        self.vertices = mesh.cells[:, : mesh.num_vertices]
+        self.vertices = mesh.vertices
         self._mesh, self._ghosts = mesh, Exchange(comm, np.empty(0, dtype=np.int64))
         self._sent: Array = np.empty(0, dtype=np.int64)
-        keys = mesh.facet_keys()
+        keys = facet_keys(mesh.cells, mesh.node_ids, mesh.cell_type)
         shape, keys = keys.shape, keys.ravel()
         across = np.repeat(np.arange(shape[0], dtype=np.int32), shape[1])
         first, second = equal_pairs(keys)

@@ -35,7 +35,6 @@ from tfeti_dolfinx.mesh.tearing import decomposed
 from tfeti_dolfinx.mesh.untorn import (
     NO_TAG,
     UntornMesh,
-    cell_dim,
     equal_pairs,
     exchange_by_key,
     facet_keys,
@@ -121,7 +120,7 @@ def check_shared(
     """
     exchange = exchange_by_key(comm, node_ids)
     node_ids, x = exchange.send(node_ids), exchange.send(x)
-    keys = set_key(mesh.node_ids[mesh.cells[:, : mesh.num_vertices]])
+    keys = set_key(mesh.node_ids[mesh.vertices])
     exchange = exchange_by_key(comm, keys)
     keys, cell_ids = exchange.send(keys), exchange.send(mesh.cell_ids)
     with raised_on_all_ranks(comm):
@@ -174,7 +173,7 @@ def untorn_mesh(
     kind, kind_name = _one_kind(with_cells, top, comm)
     shape, degree = CELLS[kind]
     cell_type = dmesh.to_type(shape)
-    gdim = cell_dim(cell_type)
+    gdim = dmesh.cell_dim(cell_type)
     variant = basix.LagrangeVariant.equispaced  # as gmsh numbers the nodes
     element = basix.ufl.element("Lagrange", shape, degree, variant, shape=(gdim,))
     none = np.empty(0, dtype=np.int64)

@@ -34,11 +34,6 @@ def set_key(ids: Array) -> Array:
     return mix(ids).sum(axis=-1, dtype=np.uint64)
 
 
-def cell_dim(cell_type: dmesh.CellType) -> int:
-    """Topological dimension of a cell."""
-    return len(basix.topology(getattr(basix.CellType, cell_type.name))) - 1
-
-
 def cell_entities(cell_type: dmesh.CellType, dim: int) -> list[Array]:
     """Local vertices of each entity of dimension ``dim``, in DOLFINx's order."""
     cell = getattr(basix.CellType, cell_type.name)
@@ -47,7 +42,7 @@ def cell_entities(cell_type: dmesh.CellType, dim: int) -> list[Array]:
 
 def facet_vertices(cell_type: dmesh.CellType) -> Array:
     """Local vertices of each facet, shape ``(num_facets, vertices_per_facet)``."""
-    return np.array(cell_entities(cell_type, cell_dim(cell_type) - 1))
+    return np.array(cell_entities(cell_type, dmesh.cell_dim(cell_type) - 1))
 
 
 def facet_keys(cells: Array, ids: Array, cell_type: dmesh.CellType) -> Array:
@@ -135,13 +130,13 @@ class UntornMesh:
         return self.x.shape[1]
 
     @property
-    def num_vertices(self) -> int:
-        """Vertices of a cell."""
-        return len(cell_entities(self.cell_type, 0))
+    def vertices(self) -> Array:
+        """Vertices among the nodes of each cell, shape ``(n, vertices_per_cell)``."""
+        return self.cells[:, : len(cell_entities(self.cell_type, 0))]
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        vertices = self.cells[:, : self.num_vertices].T
+        vertices = self.vertices.T
         total = self.x[vertices[0]]
         for vertex in vertices[1:]:
             total += self.x[vertex]
@@ -149,14 +144,10 @@ class UntornMesh:
 
     def extents(self) -> Array:
         """Sides of each cell's box along the axes, shape ``(n, gdim)``."""
-        vertices = self.cells[:, : self.num_vertices].T
+        vertices = self.vertices.T
         low = self.x[vertices[0]]
         high = low.copy()
         for vertex in vertices[1:]:
             np.minimum(low, self.x[vertex], out=low)
             np.maximum(high, self.x[vertex], out=high)
         return high - low
-
-    def facet_keys(self) -> Array:
-        """Return keys of the cells' facets that all ranks agree on, ``(n, facets_per_cell)``."""
-        return facet_keys(self.cells, self.node_ids, self.cell_type)

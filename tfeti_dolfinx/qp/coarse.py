@@ -39,7 +39,12 @@ class Coarse:
         dimension: Number r of equations.
         restricted: ZZᵀx, the part of x in the face.
         face: The face; None: all rows.
+        on_face: Of all rows: the constraint on a face of them.
+        damped_solve: Of all rows: (G_f G_fᵀ + damping·GGᵀ)⁻¹y of a face f, y and the damping.
     """
+
+    on_face: Callable[[Face], Coarse]
+    damped_solve: Callable[[Face, Array, float], Array]
 
     def __init__(
         self,
@@ -52,14 +57,6 @@ class Coarse:
         self.comm, self.Gt, self.e, self.solve, self.face = comm, Gt, e, solve, face
         self.dimension = int(Gt.shape[1])
         self.restricted: Callable[[Array], Array] = np.asarray if face is None else face.restricted
-
-    def on_face(self, face: Face) -> Coarse:
-        """Return the constraint of all rows on a face of them."""
-        raise NotImplementedError
-
-    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows."""
-        raise NotImplementedError
 
     @cached_property
     def rows(self) -> LocalMatrix:

@@ -109,6 +109,8 @@ class Predictor:
         settings: How to solve.
 
     Attributes:
+        rows_and_start: Rows, and their multipliers that the next call starts from; None at first.
+        image: F of these of a restored state, if it is known.
         multiplications: By F of the mass in the last call.
         multipliers: Of the last call: M(u − w) = −Bᵀλ.
     """
@@ -121,8 +123,8 @@ class Predictor:
         self._M: csr_array | None = None
         self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None
-        self._start: tuple[Gluing, Array] | None = None
-        self._image: Array = np.zeros(0)
+        self.rows_and_start: tuple[Gluing, Array] | None = None
+        self.image: Array = np.zeros(0)
         self.multiplications = 0
         self.multipliers: Multipliers | None = None
 
@@ -132,13 +134,10 @@ class Predictor:
 
         Empty before the first, or where the image is not known.
         """
-        if self._start is None or self._dual is None:
+        if self.rows_and_start is None or self._dual is None:
             return np.zeros(0), np.zeros(0)
-        return self._start[1], self._dual.last.known(self._dofs.comm, self._start[1])
-
-    def start_from(self, gluing: Gluing, lam: Array, image: Array) -> None:
-        """Let the next call start from multipliers of some rows, as ``start`` had them."""
-        self._start, self._image = (gluing, lam), image
+        lam = self.rows_and_start[1]
+        return lam, self._dual.last.known(self._dofs.comm, lam)
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
         """Return the nearest displacement to w.
@@ -191,13 +190,13 @@ class Predictor:
         dual, options, start = self._dual, self._options, None
         assert dual is not None
         dual.forget_counts()
-        if self._start is not None:  # nothing has a kernel in M
-            start = (gluing.multipliers(*self._start), np.zeros(0))
-            if self._start[0] is gluing:
-                dual.last.take(self._dofs.comm, self._start[1], self._image)
-        self._image = np.zeros(0)  # it is of the F and the start of a restored state alone
+        if self.rows_and_start is not None:  # nothing has a kernel in M
+            start = (gluing.multipliers(*self.rows_and_start), np.zeros(0))
+            if self.rows_and_start[0] is gluing:
+                dual.last.take(self._dofs.comm, self.rows_and_start[1], self.image)
+        self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
         result, accuracy = solve_dual(dual, options, options.qp_type, start)
-        self._start = (gluing, result.lam.copy()) if result.reason > 0 else None
+        self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
         self.multipliers = Multipliers(result.lam.copy(), result.face)
         self.multiplications = dual.F.count["solver"]
         conclude(result, accuracy, options, self._dofs.comm)
@@ -373,8 +372,8 @@ class ContactDynamics(ContactProblem):
         self.solution.v = self.dofs.to_dolfinx(state.velocity)
         known = any_rank(self.decomposition.comm, state.predicted.size > 0)
         if self._predictor is not None and known:
-            start = state.predicted, state.predicted_image
-            self._predictor.start_from(self._system.gluing, *start)
+            self._predictor.rows_and_start = self._system.gluing, state.predicted
+            self._predictor.image = state.predicted_image
 
     def _check_state(self, state: SavedState) -> None:
         super()._check_state(state)

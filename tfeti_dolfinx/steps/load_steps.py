@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing, check_same_problem
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.files import checked_path, written_whole
 from tfeti_dolfinx.common.validation import (
     checked_callable,
@@ -35,8 +36,8 @@ from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import (
     Table,
     arranged,
+    labels_of_dofs,
     labels_of_function,
-    labels_of_points,
     rows_of,
     same_labels,
 )
@@ -134,7 +135,8 @@ def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
 def labels_of_fields(solution: Solution, interior: bool = False) -> dict[str, Array]:
     """Return the labels of the unknowns of ``fields_of``, and of the points. Collective."""
     d, fields = solution.decomposition, chain(*changing_fields(solution, interior))
-    return {**{f.name: labels_of_function(f, d) for f in fields}, POINTS: labels_of_points(d)}
+    points = labels_of_dofs(geometry_dofmap(d.mesh), len(d.mesh.geometry.x), d)
+    return {**{f.name: labels_of_function(f, d) for f in fields}, POINTS: points}
 
 
 def in_order(table: Table, labels: dict[str, Array]) -> dict[str, Array]:
