@@ -75,7 +75,7 @@ def dense(p):
 
 def test_the_inverse_is_that_of_the_saddle_point_problem(clustered):
     subdomains, (K, B) = clustered.dual.subdomains, dense(clustered)
-    n, r = len(K), subdomains.kernel_size
+    n, r = len(K), subdomains.kernel_rows.shape[1]
     R = np.array([subdomains.kernel_motion(alpha) for alpha in np.eye(r)]).reshape(r, n).T
     assert np.allclose(R.T @ R, np.eye(r), atol=1e-12)
     assert np.abs(K @ R).max(initial=0.0) <= 1e-12

@@ -46,7 +46,7 @@ def test_numberings_are_inverse_to_each_other():
     assert np.array_equal(dofs.to_dolfinx(dofs.to_primal(values)), values)
     assert np.array_equal(values[dofs.dolfinx_dofs()], dofs.to_primal(values))
     nodes = np.arange(dofs.num_nodes)
-    assert np.array_equal(dofs.primal_nodes(dofs.dolfinx_node), nodes)
+    assert np.array_equal(dofs.primal_node[dofs.dolfinx_node], nodes)
     assert np.all(np.diff(dofs.node_subdomain) >= 0)
     assert np.array_equal(np.unique(dofs.node_subdomain), d.subdomains)
 

@@ -74,7 +74,7 @@ def test_other_values_and_gaps_cost_a_vector(cell, degree):
     assert np.allclose(updated.prescribed.value, anew.prescribed.value)
     assert not np.array_equal(gluing.records.gap, gaps) or len(gaps) == 0
     for item in (gluing, anew):
-        item.constraints.destroy()
+        item.constraints.B.destroy()
 
 
 def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():

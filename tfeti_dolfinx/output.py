@@ -157,7 +157,7 @@ class PvdFile:
         partial: The folder until then.
 
     Raises:
-        InputError: It cannot be written, as all methods but ``drop`` say, too.
+        InputError: It cannot be written, as all methods say, too.
     """
 
     def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
@@ -195,11 +195,6 @@ class PvdFile:
         _drop(self.partial, self._comm)
         return [self._name.with_name(part) for part in self._comm.bcast(names, root=0)]
 
-    def drop(self) -> None:
-        """Remove the folder."""
-        self.close()
-        _drop(self.partial, self._comm)
-
 
 class VtxFile:
     """A VTX file that has another name until it is whole. Creation and methods are collective.
@@ -215,7 +210,7 @@ class VtxFile:
         partial: Its name until then.
 
     Raises:
-        InputError: It cannot be written, as all methods but ``drop`` say, too.
+        InputError: It cannot be written, as all methods say, too.
     """
 
     def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
@@ -243,12 +238,6 @@ class VtxFile:
         """Give the file its name, in the place of what has it."""
         end_file(self.partial, self._name, self._comm)
         return [self._name]
-
-    def drop(self) -> None:
-        """Remove the file under the name that it has until it is whole."""
-        with suppress(TfetiError):
-            self.close()
-        _drop(self.partial, self._comm)
 
     def _of_library(self, do: Callable[[], None]) -> None:
         """Write, and never again where that fails."""
@@ -346,7 +335,9 @@ class Series:
     def drop(self) -> None:
         """Remove the files under the names that they have until ``close``."""
         for file in self._files:
-            file.drop()
+            with suppress(TfetiError):
+                file.close()
+            _drop(file.partial, self._mesh.comm)
 
 
 def nodal_fields(solution: Solution) -> list[fem.Function]:

@@ -72,8 +72,7 @@ def labels_of_function(f: fem.Function, decomposition: Decomposition) -> Array:
 
 def labels_of_nodes(dofs: TornDofs) -> Array:
     """Return labels of primal nodes."""
-    cells = dofs.primal_nodes(np.asarray(dofs.V.dofmap.list).ravel())
-    cells = cells.reshape(dofs.V.dofmap.list.shape)
+    cells = dofs.primal_node[np.asarray(dofs.V.dofmap.list)]
     return labels_of_dofs(cells, dofs.num_nodes, dofs.decomposition)
 
 

@@ -378,7 +378,7 @@ class System:
         self._destroy_subdomains()
         self._equals.kept.clear()
         if self._gluing is not None:
-            self._gluing.constraints.destroy()
+            self._gluing.constraints.B.destroy()
         self._gluing = None
         self._stale = set(STAGES)
 
@@ -416,7 +416,7 @@ class System:
 
     def _make_rows(self) -> None:
         if self._gluing is not None:
-            self._gluing.constraints.destroy()
+            self._gluing.constraints.B.destroy()
         search, dofs, tools = self.search, self._dofs, self.tools
         search.move()
         if self.weights is None or not self.follows:

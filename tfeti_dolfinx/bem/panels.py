@@ -179,7 +179,7 @@ def surfaces(dofs: TornDofs, decomposition: Decomposition, chosen: Array) -> dic
         outside[decomposition.tears] = outside[decomposition.boundary] = True
         position = np.searchsorted(dofs.subdomains, decomposition.cell_subdomain)
         cell, local = np.nonzero(outside[facets] & chosen[position][:, None])
-        corners = dofs.primal_nodes(np.asarray(dofs.V.dofmap.list)[cell])
+        corners = dofs.primal_node[np.asarray(dofs.V.dofmap.list)[cell]]
         local_corners = facet_vertices(mesh.topology.cell_type)[local]
         nodes = np.take_along_axis(corners, local_corners, axis=1)
         middle, where = x[corners].mean(axis=1), position[cell]

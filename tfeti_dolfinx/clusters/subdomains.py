@@ -457,11 +457,6 @@ class ClusteredSubdomains(Subdomains):
     # ------------------------------------------------------------------ kernels
 
     @property
-    def kernel_size(self) -> int:
-        """r̃."""
-        return int(self.null.shape[1])
-
-    @property
     def kernel_rows(self) -> csr_array:
         """R̃ on the trace, shape ``(t, r̃)``."""
         return csr_array(super().kernel_rows @ self.null)

@@ -51,10 +51,6 @@ class HeldRows:
     component: Array
     factor: Array
 
-    def right_side(self, values: Array) -> Array:
-        """Right sides of these rows, from values of the owned groups, shape ``(g, bs)``."""
-        return values.ravel()[self.component] * self.factor
-
 
 def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, HeldRows]:
     """B_E, and which of its rows hold prescribed components, by flags of the groups, ``(g, bs)``.
@@ -242,7 +238,7 @@ def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
     cell, place = np.nonzero(chosen[of_cells])
     element, fdim = V.element.basix_element, V.mesh.topology.dim - 1
     on_facet = np.array(element.entity_closure_dofs[fdim])[place]
-    return dofs.primal_nodes(np.take_along_axis(np.asarray(V.dofmap.list)[cell], on_facet, axis=1))
+    return dofs.primal_node[np.take_along_axis(np.asarray(V.dofmap.list)[cell], on_facet, axis=1)]
 
 
 def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
@@ -345,7 +341,7 @@ class Gluing:
         along = np.einsum("ntg,ng->nt", records.tangents, held)
         slips = ((self.slip if slip is None else slip) - along)[tangents.condition]
         c = np.zeros(self.constraints.num_rows)
-        c[sets.equalities[self.held.row]] = self.held.right_side(values)
+        c[sets.equalities[self.held.row]] = values.ravel()[self.held.component] * self.held.factor
         c[sets.normals] = left[normals.condition] * normals.scale
         c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
         return c
@@ -383,7 +379,9 @@ class Gluing:
         Contacts meet prescribed components where the prescribed values have them.
         """
         c = np.array(self.constraints.c)
-        c[self.constraints.sets.equalities[self.held.row]] = self.held.right_side(values)
+        c[self.constraints.sets.equalities[self.held.row]] = (
+            values.ravel()[self.held.component] * self.held.factor
+        )
         return c
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
@@ -476,6 +474,6 @@ def glue(
     try:
         constraints.c[:] = gluing.right_side(prescribed.value, records.gap)
     except TfetiError:  # on all ranks
-        constraints.destroy()
+        constraints.B.destroy()
         raise
     return gluing

@@ -198,10 +198,6 @@ class Constraints:
         limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
         return replace(self, limits=limits)
 
-    def destroy(self) -> None:
-        """Destroy B. Collective."""
-        self.B.destroy()
-
 
 def _taken(result: PETSc.Vec, other: PETSc.Vec) -> Array:
     """Return the values of a vector, and destroy both. Collective."""

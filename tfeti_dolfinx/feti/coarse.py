@@ -74,10 +74,11 @@ class CoarseSpace(Coarse):
     ) -> None:
         self.subdomains, self.bounded, self.rubbing = subdomains, bounded, rubbing
         self.comm = comm = subdomains.comm
-        offsets = chunk_offsets(comm, subdomains.kernel_size)
+        kernel = subdomains.kernel_rows
+        offsets = chunk_offsets(comm, kernel.shape[1])
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
-        Gt = transposed_G(B, subdomains.kernel_rows, dimension)
+        Gt = transposed_G(B, kernel, dimension)
         self.row_size = _sizes(B)
         self.bodies = Bodies(subdomains, self._own.start, dimension)
         self.J = _without_rounding(rows_times(Gt, 1.0 / self.row_size) @ self.bodies.motions)
@@ -106,7 +107,7 @@ class CoarseSpace(Coarse):
         if not self.dimension:
             return np.zeros(0)
         e = joined_over(self.comm, self.subdomains.kernel_load)
-        return self._basis.products(e)
+        return np.concatenate((self._basis.motions.T @ e, e[self._basis.rest]))
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""

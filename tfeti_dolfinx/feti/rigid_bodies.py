@@ -347,10 +347,6 @@ class KernelBasis:
     unheld: Array
     free: Array
 
-    def products(self, x: Array) -> Array:
-        """Tᵀx."""
-        return np.concatenate((self.motions.T @ x, x[self.rest]))
-
     def kernel(self, y: Array) -> Array:
         """T y."""
         x = self.motions @ y[: len(self.pins)]

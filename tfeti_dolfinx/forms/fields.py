@@ -263,7 +263,7 @@ class StressRecovery:
             sums = sum_rows(cells.ravel(), terms.reshape(-1, size * (size + q)), dofs.num_nodes)
             system = dofs.reduce(sums[dofs.dolfinx_node], np.add).reshape(-1, size, size + q)
             at_nodes = dofs.spread(_constants(system[:, :, :size], system[:, :, size:]))
-            found[own] = at_nodes[dofs.primal_nodes(cells)]
+            found[own] = at_nodes[dofs.primal_node[cells]]
         return found
 
 

@@ -129,7 +129,7 @@ class TornDofs:
         multiplicity: Number of copies in each owned group, shape ``(g,)``.
         subdomains: Subdomains of this rank, ascending, shape ``(S,)``.
         node_offsets: First primal node of each subdomain, shape ``(S + 1,)``.
-        dolfinx_node: DOLFINx's node for each primal node, shape ``(n,)``.
+        dolfinx_node: DOLFINx's node for each primal node, primal_node the reverse, shapes ``(n,)``.
         offsets: First global primal node of each rank, shape ``(size + 1,)``.
         group_offsets: First global group of each rank, shape ``(size + 1,)``.
         group: Global group of each local primal node, shape ``(n,)``.
@@ -170,10 +170,6 @@ class TornDofs:
     def dolfinx_dofs(self) -> Array:
         """DOLFINx's unrolled dof for each primal dof, shape ``(n * bs,)``."""
         return (self.dolfinx_node[:, None] * self.bs + np.arange(self.bs)).ravel()
-
-    def primal_nodes(self, dolfinx_nodes: Array) -> Array:
-        """Primal nodes of DOLFINx's local nodes."""
-        return self._primal_node[dolfinx_nodes]
 
     def reduce(self, values: Array, op: np.ufunc) -> Array:
         """Combine the values of all copies of a node: ``(n, ...)`` to ``(g, ...)``. Collective.
@@ -225,7 +221,7 @@ class TornDofs:
         cells = np.asarray(W.dofmap.list)
         node = np.empty(W.dofmap.index_map.size_local, dtype=np.int64)
         node[cells] = np.asarray(self.V.dofmap.list)[:, : cells.shape[1]]
-        return W, self.primal_nodes(node)
+        return W, self.primal_node[node]
 
     def gather_copies(self, values: Array) -> Array:
         """Give values of nodes, ``(n, ...)``, to the owned ``copies``, ``(c, ...)``. Collective."""
@@ -252,8 +248,8 @@ class TornDofs:
         subdomain = np.empty(self.num_nodes, dtype=np.int64)
         subdomain[cells] = decomposition.cell_subdomain[:, None]
         self.dolfinx_node = np.argsort(subdomain, kind="stable")
-        self._primal_node = np.empty_like(self.dolfinx_node)
-        self._primal_node[self.dolfinx_node] = np.arange(self.num_nodes)
+        self.primal_node = np.empty_like(self.dolfinx_node)
+        self.primal_node[self.dolfinx_node] = np.arange(self.num_nodes)
         self.subdomains = decomposition.subdomains
         in_order = subdomain[self.dolfinx_node]
         self.node_offsets = np.append(np.searchsorted(in_order, self.subdomains), self.num_nodes)
@@ -271,7 +267,7 @@ class TornDofs:
         facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
         fdim = decomposition.mesh.topology.dim - 1
         on_facets = fem.locate_dofs_topological(self.V, fdim, facets, remote=False)
-        shared = self.primal_nodes(on_facets)
+        shared = self.primal_node[on_facets]
         meeting = exchange_by_key(self.comm, key[shared])
         met, subdomain = meeting.send(key[shared]), meeting.send(self.node_subdomain[shared])
         order = np.lexsort((subdomain, met))

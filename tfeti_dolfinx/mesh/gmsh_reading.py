@@ -62,19 +62,15 @@ def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> 
             if not path.is_file() and path.parent.is_dir():
                 matches = (parts.fullmatch(entry.name) for entry in path.parent.iterdir())
                 numbers = {int(match[1]) for match in matches if match}
-                files = [_part(path, number) for number in range(1, max(numbers, default=0) + 1)]
+                last = max(numbers, default=0)
+                files = [path.with_stem(f"{path.stem}_{k}") for k in range(1, last + 1)]
                 if len(files) > len(numbers):
                     missing = min(set(range(1, len(files) + 1)) - numbers)
                     raise InputError(
-                        f"{_part(path, missing)}: no such file, but {files[-1].name} is there; "
+                        f"{files[missing - 1]}: no such file, but {files[-1].name} is there; "
                         f"expected either {path.name}, or one file for each partition from 1 on"
                     )
     return comm.bcast(files, root=0)
-
-
-def _part(path: Path, number: int) -> Path:
-    """Return the name of the file of a partition, numbered from 1."""
-    return path.with_name(f"{path.stem}_{number}{path.suffix}")
 
 
 def read_split_files(files: Sequence[Path], comm: MPI.Intracomm) -> list[ModelContent]:

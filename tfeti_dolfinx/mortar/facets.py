@@ -202,7 +202,7 @@ def local_facets(dofs: TornDofs, facets: Array) -> Facets:
     sign = np.sign(np.sum(at_vertices * normal, axis=2, keepdims=True))
     return Facets(
         x=np.ascontiguousarray(x),
-        groups=dofs.group[dofs.primal_nodes(displacement)],
+        groups=dofs.group[dofs.primal_node[displacement]],
         normal=normal,
         vertex_normals=np.ascontiguousarray((sign * _unit(at_vertices)).swapaxes(0, 1)),
         area=area,
@@ -357,7 +357,7 @@ def surface_nodes(dofs: TornDofs, facets: Array) -> Array:
     """Primal nodes of local facets."""
     fdim = dofs.V.mesh.topology.dim - 1
     nodes = fem.locate_dofs_topological(dofs.V, fdim, facets.astype(np.int32), remote=False)
-    return dofs.primal_nodes(nodes)
+    return dofs.primal_node[nodes]
 
 
 def group_points(dofs: TornDofs) -> Array:

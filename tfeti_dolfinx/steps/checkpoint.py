@@ -268,7 +268,7 @@ class Checkpoint:
         with written_whole(self.path / name) as partial, partial.open("wb") as file:
             np.savez(file, **cast(dict[str, Any], arrays))
             _settle(file)
-        return _checksum_in(self.path / name)
+        return _hash((self.path / name).read_bytes()).hexdigest()
 
     def _load(
         self,
@@ -294,7 +294,7 @@ class Checkpoint:
             for rank in {rank_of[s] for s in self._subdomains} or {0}:
                 file = self.path / f"{kind}_{number}_{rank}.npz"
                 with named(f"cannot read {file}", OSError):
-                    if _checksum_in(file) != checksums[rank]:
+                    if _hash(file.read_bytes()).hexdigest() != checksums[rank]:
                         raise damaged(file, where)
                     with np.load(file) as contents:
                         found[rank] = dict(contents)
@@ -395,11 +395,6 @@ def _locked(folder: Path) -> int:
     except OSError:
         pass
     return lock
-
-
-def _checksum_in(file: Path) -> str:
-    with file.open("rb") as opened:
-        return hashlib.file_digest(opened, _hash).hexdigest()
 
 
 def _sealed(content: Mapping[str, Any]) -> bytes:

@@ -186,11 +186,6 @@ class Subdomains:
     # ------------------------------------------------------------------ kernels
 
     @property
-    def kernel_size(self) -> int:
-        """r."""
-        return sum(block.kernel.shape[1] for block in self.blocks)
-
-    @property
     def kernel_rows(self) -> csr_array:
         """R on the trace, shape ``(t, r)``."""
         parts = [block.kernel[block.trace_dofs] for block in self.blocks]
