@@ -6,15 +6,14 @@ Shapes and units stand in the docstrings.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
 Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
@@ -60,7 +59,16 @@ def rows_times(A: Any, factors: Array) -> csr_array:
     return csr_array((data, A.indices, A.indptr), shape=A.shape)
 
 
-def submatrix(A: Any, rows: Array | slice, columns: Array) -> csr_array:
+class Entries(NamedTuple):
+    """The arrays of a CSR matrix and its shape, as scipy's have them, by the same names."""
+
+    data: Array
+    indices: Array
+    indptr: Array
+    shape: tuple[int, int]
+
+
+def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
     """Return A[rows][:, columns] of a CSR matrix, columns ascending."""
     rows = np.arange(A.shape[0])[rows]
     place = np.full(A.shape[1], -1, dtype=A.indices.dtype)
@@ -69,14 +77,23 @@ def submatrix(A: Any, rows: Array | slice, columns: Array) -> csr_array:
     column = place[A.indices[entries]]
     kept = column >= 0
     table = np.concatenate(([0], np.cumsum(kept)))[table]
-    shape = len(rows), len(columns)
-    return csr_array((A.data[entries[kept]], column[kept], table), shape=shape)
+    return Entries(A.data[entries[kept]], column[kept], table, (len(rows), len(columns)))
+
+
+def submatrix(A: Any, rows: Array | slice, columns: Array) -> csr_array:
+    """Return ``entries_within`` as a matrix of scipy."""
+    *arrays, shape = entries_within(A, rows, columns)
+    return csr_array(tuple(arrays), shape=shape)
 
 
 def as_petsc_matrix(A: Any) -> PETSc.Mat:
-    """A as a matrix of PETSc, on the same arrays if they are sorted CSR of PETSc's integers."""
-    A = A.tocsr()
-    A.sort_indices()
+    """A as a matrix of PETSc, on the same arrays if they are CSR of PETSc's integers, and sorted.
+
+    A matrix of scipy is sorted; columns of a row of ``Entries`` ascend.
+    """
+    if not isinstance(A, Entries):
+        A = A.tocsr()
+        A.sort_indices()
     table = (*(array.astype(PETSc.IntType, copy=False) for array in (A.indptr, A.indices)), A.data)
     return PETSc.Mat().createAIJWithArrays(A.shape, table, comm=PETSc.COMM_SELF)
 
@@ -85,41 +102,46 @@ class LocalMatrix:
     """A CSR matrix for many products: PETSc's, without scipy's checks of both factors.
 
     Attributes:
-        A: The matrix, on whose arrays it is.
-        few: Most vectors that are taken one after the other: scipy is faster with more.
+        shape: Its shape.
+        count: Number of its entries.
     """
 
-    few = 8
-
-    def __init__(self, A: csr_array) -> None:
-        self.A, self._petsc = A, as_petsc_matrix(A)
-        # sums in the order of scipy: rounding does not depend on which of the two multiplies
+    def __init__(self, A: csr_array | Entries) -> None:
+        self.shape, self.count, self._petsc = A.shape, len(A.data), as_petsc_matrix(A)
+        # sums are those of scipy to the last bit, and so the same in any number of columns
         self._petsc.setOption(PETSc.Mat.Option.USE_INODES, False)
         self._x, self._y = self._petsc.createVecs()
 
-    @cached_property
-    def _At(self) -> csc_array:
-        return self.A.T
-
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
-        if x.ndim == 1:
-            self._x.setArray(x)
-            self._petsc.mult(self._x, self._y)
-            return np.array(self._y.array_r)
-        if not 0 < x.shape[1] <= self.few:
-            return np.asarray(self.A @ x)
-        return np.array([self @ column for column in x.T]).T
+        if x.ndim > 1:
+            return _of_columns(self._petsc.matMult, x)
+        self._x.setArray(x)
+        self._petsc.mult(self._x, self._y)
+        return np.array(self._y.array_r)
 
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""
-        if y.ndim == 1:
-            self._y.setArray(y)
-            self._petsc.multTranspose(self._y, self._x)
-            return np.array(self._x.array_r)
-        if not 0 < y.shape[1] <= self.few:
-            return np.asarray(self._At @ y)
-        return np.array([self.transposed(column) for column in y.T]).T
+        if y.ndim > 1:
+            return _of_columns(self._petsc.transposeMatMult, y)
+        self._y.setArray(y)
+        self._petsc.multTranspose(self._y, self._x)
+        return np.array(self._x.array_r)
+
+    def entries(self) -> Entries:
+        """Return copies of its arrays."""
+        indptr, indices, data = self._petsc.getValuesCSR()
+        return Entries(data, indices, indptr, self.shape)
+
+
+def _of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array) -> Array:
+    """Return a product of PETSc with columns."""
+    given = PETSc.Mat().createDense(x.shape, array=np.asfortranarray(x), comm=PETSc.COMM_SELF)
+    made = product(given)
+    found = np.array(made.getDenseArray(readonly=True), order="F")
+    given.destroy()
+    made.destroy()
+    return found
 
 
 def node_blocks(K: Any, bs: int) -> Array:

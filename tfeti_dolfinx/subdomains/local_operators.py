@@ -10,9 +10,8 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg.blas import dsymm, dsymv
-from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array, LocalMatrix, parts_of
+from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
@@ -137,9 +136,9 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """S through the factor of K_ii."""
     traced = equal[0][0].traced
-    work = 2.0 * traced.stiffness.A.nnz
+    work = 2.0 * traced.stiffness.count
     if traced.inner is not None:
-        work += 4.0 * (traced.coupling.A.nnz + traced.inner.entries)
+        work += 4.0 * (traced.coupling.count + traced.inner.entries)
     size, parts = len(traced.trace), [part for _, part in equal]
     places = _places([block.trace_rows for block, _ in equal], size, parts)
     return Group(len(equal), size, len(equal), *places, traced.apply_schur, work)
@@ -151,20 +150,20 @@ def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
     rows, K_bb = [block.trace_rows for block, _ in blocks], next(iter(traces)).stiffness
     if len(traces) > 1:
         begins = np.cumsum([0, *(len(row) for row in rows)])
-        matrices = [traced.stiffness.A for traced in traces]
+        matrices = [traced.stiffness.entries() for traced in traces]
         columns = [a + K.indices for a, K in zip(begins, matrices, strict=False)]
         table = np.cumsum(np.concatenate([[0], *(np.diff(K.indptr) for K in matrices)]))
-        data = np.concatenate([K.data for K in matrices]), np.concatenate(columns), table
-        K_bb = LocalMatrix(csr_array(data, shape=(begins[-1],) * 2))
+        data, shape = np.concatenate([K.data for K in matrices]), (int(begins[-1]),) * 2
+        K_bb = LocalMatrix(Entries(data, np.concatenate(columns), table, shape))
         rows = [np.concatenate([a + row for a, row in zip(begins, rows, strict=False)])]
-    size, parts = K_bb.A.shape[0], [part for _, part in blocks]
+    size, parts = K_bb.shape[0], [part for _, part in blocks]
     return Group(
         len(blocks),
         size,
         len(rows),
         *_places(rows, size, parts),
         K_bb.__matmul__,
-        2.0 * K_bb.A.nnz,
+        2.0 * K_bb.count,
         can_be_dense=False,
     )
 

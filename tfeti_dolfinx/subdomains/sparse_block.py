@@ -13,7 +13,14 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix, entries_of_rows, submatrix
+from tfeti_dolfinx.common.arrays import (
+    TINY,
+    Array,
+    LocalMatrix,
+    entries_of_rows,
+    entries_within,
+    submatrix,
+)
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import (
@@ -124,12 +131,12 @@ class Traced:
     @cached_property
     def stiffness(self) -> LocalMatrix:
         """K_bb, that on the trace."""
-        return LocalMatrix(submatrix(self._of.K, self.trace, self.trace))
+        return LocalMatrix(entries_within(self._of.K, self.trace, self.trace))
 
     @cached_property
     def coupling(self) -> LocalMatrix:
         """K_ib."""
-        return LocalMatrix(submatrix(self._of.K, self.inside, self.trace))
+        return LocalMatrix(entries_within(self._of.K, self.inside, self.trace))
 
     @cached_property
     def inner(self) -> CholeskyFactor | None:
