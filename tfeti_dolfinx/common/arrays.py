@@ -67,6 +67,17 @@ class Entries(NamedTuple):
     indptr: Array
     shape: tuple[int, int]
 
+    def csr(self) -> csr_array:
+        """Return them as a matrix of scipy."""
+        return csr_array((self.data, self.indices, self.indptr), shape=self.shape)
+
+
+def entries_at(row: Array, column: Array, value: Array, shape: tuple[int, int]) -> Entries:
+    """Return the entries at these places, none of them twice."""
+    order = np.lexsort((column, row))
+    table = np.searchsorted(row[order], np.arange(shape[0] + 1))
+    return Entries(value[order], column[order], table, shape)
+
 
 def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
     """Return A[rows][:, columns] of a CSR matrix, columns ascending."""
@@ -78,12 +89,6 @@ def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
     kept = column >= 0
     table = np.concatenate(([0], np.cumsum(kept)))[table]
     return Entries(A.data[entries[kept]], column[kept], table, (len(rows), len(columns)))
-
-
-def submatrix(A: Any, rows: Array | slice, columns: Array) -> csr_array:
-    """Return ``entries_within`` as a matrix of scipy."""
-    *arrays, shape = entries_within(A, rows, columns)
-    return csr_array(tuple(arrays), shape=shape)
 
 
 def as_petsc_matrix(A: Any) -> PETSc.Mat:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, Entries
 
 T = TypeVar("T")
 
@@ -82,6 +82,13 @@ def joined_over(comm: MPI.Intracomm, own: Array) -> Array:
     whole = np.empty(int(sizes.sum()), dtype=own.dtype)
     comm.Allgatherv(np.ascontiguousarray(own), [whole, sizes.tolist()])
     return whole
+
+
+def rows_over(comm: MPI.Intracomm, own: Any) -> Entries:
+    """Return the rows of all ranks' CSR matrices, one after the other. Collective."""
+    table = np.concatenate(([0], np.cumsum(joined_over(comm, np.diff(own.indptr)))))
+    data, indices = (joined_over(comm, part) for part in (own.data, own.indices))
+    return Entries(data, indices, table, (len(table) - 1, own.shape[1]))
 
 
 class Exchange:

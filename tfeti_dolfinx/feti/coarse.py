@@ -21,6 +21,7 @@ from tfeti_dolfinx.feti.rigid_bodies import (
     TOLERANCES,
     Bodies,
     Motions,
+    gram_of,
     kernel_basis,
     orthonormal_columns,
     unresisted,
@@ -80,7 +81,7 @@ class CoarseSpace(Coarse):
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         Gt = transposed_G(B, kernel, dimension)
         self.row_size = _sizes(B)
-        self.bodies = Bodies(subdomains, self._own.start, dimension)
+        self.bodies = Bodies(subdomains)
         self.J = _without_rounding(rows_times(Gt, 1.0 / self.row_size) @ self.bodies.motions)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[np.concatenate((bounded, rubbing))] = False
@@ -152,7 +153,7 @@ class CoarseSpace(Coarse):
             FactorError: Forces on the face do not determine what balances a load.
         """
         self.factors.count["face"] += int(self.dimension > 0)
-        return ObliqueProjectors(self.Gt, self.grams, face, C, self.null, self.comm)
+        return ObliqueProjectors(self.grams, face, C, self.null, self.comm)
 
     def unresisted(
         self, rows: Array, within: Motions | None = None, below: float = TOLERANCES.null
@@ -169,12 +170,11 @@ class CoarseSpace(Coarse):
             below: Motions of a single body that are held by less than this share of what the
                 same rows hold at most are taken in, too.
         """
-        J = self.J[rows]
-        grams = self.comm.gather(J.T.tocsr() @ J, root=0)
+        grams = self.comm.gather(gram_of(self.J, rows, self.bodies.count, self.bodies.k), root=0)
         found: Any = None
         with raised_on_all_ranks(self.comm):
             if grams is not None:
-                found = unresisted(sum(grams[1:], grams[0]), within or self.unheld, below)
+                found = unresisted(grams, within or self.unheld, below)
         return cast(Motions, bcast_from_root(self.comm, found))
 
 

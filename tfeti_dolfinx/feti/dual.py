@@ -210,7 +210,7 @@ class Dual:
             if not any_rank(comm, apart > LIMITS.parallel * size):
                 return
         self._held_load = None
-        check_solvable(coarse, self._given, *self._names)
+        check_solvable(coarse, self._given, load, *self._names)
         limited = len(self._given.pressed) < len(self._given.sets.tangents)
         if not any_rank(comm, limited or size == 0.0):
             self._held_load = load / size

@@ -10,8 +10,8 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from tfeti_dolfinx.common.arrays import Array, LocalMatrix
-from tfeti_dolfinx.common.parallel import bcast_from_root, joined_over, largest
+from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix
+from tfeti_dolfinx.common.parallel import bcast_from_root, joined_over, largest, rows_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import side_by_side
@@ -345,11 +345,9 @@ class ContactFactor:
         self._own = slice(first, last)
         indptr, indices, data = A.getValuesCSR()
         A.destroy()
-        counts = joined_over(self._comm, np.diff(indptr))
-        table = np.concatenate(([0], np.cumsum(counts)))
-        parts = (joined_over(self._comm, part) for part in (data, indices))
+        whole = rows_over(self._comm, Entries(data, indices, indptr, (last - first, size)))
         with raised_on_all_ranks(self._comm):
-            self._factor = CholeskyFactor(csr_array((*parts, table), shape=(size, size)), prefix)
+            self._factor = CholeskyFactor(whole, prefix)
 
     def solve(self, b: Array) -> Array:
         """A⁻¹b, of this rank's parts. Collective."""

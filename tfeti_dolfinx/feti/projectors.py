@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
-from tfeti_dolfinx.common.arrays import TINY, Array, rows_times
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries
 from tfeti_dolfinx.common.parallel import any_rank, joined_over, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
@@ -27,20 +28,22 @@ class Grams:
     An entry is stored for each pair of coordinates that meet in a row, so that storage grows with
     the number of subdomains. A face costs what its contact rows cost, ``bounded``, which some set
     may constrain: rows of the same coordinates make a dense block, and the sum of these is reduced
-    over ranks as far as contact rows reach. Collective. ``whole`` is GGᵀ, shape ``(r, r)``.
+    over ranks as far as contact rows reach. Collective. ``Gt`` is this rank's Gᵀ, and
+    ``whole`` GGᵀ, shape ``(r, r)``.
     """
 
     def __init__(self, Gt: csr_array, bounded: Array, comm: MPI.Intracomm) -> None:
-        self._comm, self._Gt, size = comm, Gt, Gt.shape[1]
+        self._comm, self.Gt, size = comm, Gt, Gt.shape[1]
         self._always = np.ones(Gt.shape[0], dtype=bool)
         self._always[bounded] = False
         always = Gt[self._always]
-        base = replicated(always.T.tocsr() @ always, comm).tocoo()
+        base = replicated(always.T.tocsr() @ always, comm)
         # 1. the entries that contact rows reach, on all ranks, and those of the whole
         parts = list(_blocks(Gt, bounded))
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
         reached = np.unique(joined_over(comm, own))
-        known = base.coords[0].astype(np.int64) * size + base.coords[1]
+        row = np.repeat(np.arange(size), np.diff(base.indptr))
+        known = row * size + base.indices
         entries = np.union1d(known, reached)
         row, column = np.divmod(entries, max(size, 1))
         # 2. where they stand
@@ -52,12 +55,17 @@ class Grams:
         everything = np.ones(Gt.shape[0], dtype=bool)
         self.whole = self.of_face(Face(everything, np.full(len(everything), Status.FREE)))
 
+    @cached_property
+    def G(self) -> csr_array:
+        """This rank's columns of G, shape ``(r, m_local)``."""
+        return self.Gt.T.tocsr()
+
     def of_face(self, face: Face, damping: float = 0.0) -> csr_array:
         """GZ(GZ)ᵀ + damping·GGᵀ, shape ``(r, r)``.
 
         Of all rows anew where a set constrains others than ``bounded``.
         """
-        size = self._Gt.shape[1]
+        size = self.Gt.shape[1]
         if not size:
             return csr_array((0, 0))
         sums: Array = np.zeros(len(self._reached) + 2)
@@ -67,7 +75,7 @@ class Grams:
         sums[-2:] = np.any(face.status[self._always] != Status.FREE), len(face.tangents)
         *_, others, tangents = summed(self._comm, sums)
         if others:
-            along = face.Z.T @ self._Gt
+            along = face.Z.T @ self.Gt
             gram = replicated(along.T.tocsr() @ along, self._comm)
             return gram + damping * self.whole if damping else gram
         data = np.array(self._base)
@@ -76,7 +84,7 @@ class Grams:
             data += damping * self.whole.data
         gram = csr_array((data, *self._table), shape=(size, size))
         if tangents:
-            along = face.T.T @ self._Gt
+            along = face.T.T @ self.Gt
             gram = gram + replicated(along.T.tocsr() @ along, self._comm)
         return gram
 
@@ -100,6 +108,8 @@ def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
 
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
     """Return the sum of all ranks' sparse matrices, scipy CSR, on all ranks. Collective."""
+    if comm.size == 1:
+        return part
     own = np.repeat(np.arange(part.shape[0]), np.diff(part.indptr)), part.indices
     row, column = (joined_over(comm, index.astype(np.int64)) for index in own)
     value = joined_over(comm, part.data)
@@ -134,15 +144,16 @@ class SemidefiniteFactor:
     ) -> None:
         self.comm, self._null = comm, null if null.shape[1] else None
         self._scale, pinned = _scaling(A, null)
-        self._A = _scaled(A, self._scale, pinned)
+        scaled = _scaled(A, self._scale, pinned)
         self._factor: CholeskyFactor | None = None
         self._shift = 0.0
         for self._shift in SHIFTS if A.shape[0] else ():
             lost = False
             with raised_on_all_ranks(comm):
                 try:
-                    shifted = self._A
-                    if self._shift:
+                    shifted: Entries | csr_array = scaled
+                    if self._shift:  # only refinement needs the matrix
+                        self._A = scaled.csr()
                         shifted = csr_array(self._A + self._shift * eye_array(A.shape[0]))
                     self._factor = CholeskyFactor(shifted, prefix)
                 except FactorError as error:
@@ -152,8 +163,6 @@ class SemidefiniteFactor:
             if not any_rank(comm, lost):
                 break
             self._factor = None
-        if not self._shift:  # only refinement needs the matrix
-            del self._A
 
     def solve(self, y: Array) -> Array:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""
@@ -179,11 +188,15 @@ def _scaling(A: csr_array, null: csr_array) -> tuple[Array, Array]:
     return scale, pinned
 
 
-def _scaled(A: csr_array, scale: Array, pinned: Array) -> csr_array:
+def _scaled(A: csr_array, scale: Array, pinned: Array) -> Entries:
     """SAS + diag(pinned)."""
-    scaled = rows_times(A, scale)
-    scaled.data *= scale[A.indices]
-    return scaled + diags_array(pinned) if np.any(pinned) else scaled
+    A.sort_indices()
+    values = A.data * np.repeat(scale, np.diff(A.indptr)) * scale[A.indices]
+    scaled = Entries(values, A.indices, A.indptr, A.shape)
+    if not np.any(pinned):
+        return scaled
+    made = csr_array(scaled.csr() + diags_array(pinned))
+    return Entries(made.data, made.indices, made.indptr, made.shape)
 
 
 def _without(null: csr_array, x: Array) -> Array:
@@ -207,25 +220,19 @@ class ObliqueProjectors:
     """
 
     def __init__(
-        self,
-        Gt: csr_array,
-        grams: Grams,
-        face: Face,
-        C: csr_array,
-        null: csr_array,
-        comm: MPI.Intracomm,
+        self, grams: Grams, face: Face, C: csr_array, null: csr_array, comm: MPI.Intracomm
     ) -> None:
-        self._comm, self._face, self._Gt, self._null = comm, face, Gt, null
-        self._G, self._C = Gt.T, C
-        led = csr_array((C.data * face.free[C.indices], C.indices, C.indptr), C.shape) @ Gt
-        A, N = grams.of_face(face), replicated(self._G.tocsr() @ led, comm)
+        self._comm, self._face, self._null, self._C = comm, face, null, C
+        self._G, self._Gt = grams.G, grams.Gt
+        led = csr_array((C.data * face.free[C.indices], C.indices, C.indptr), C.shape) @ grams.Gt
+        A, N = grams.of_face(face), replicated(grams.G @ led, comm)
         self._scale, pinned = _scaling(A, null)
         self._factor = None
         with raised_on_all_ranks(comm):
             try:
-                if Gt.shape[1]:
+                if A.shape[1]:
                     H = _scaled(A + N, self._scale, pinned)
-                    self._factor = splu(H.tocsc())
+                    self._factor = splu(H.csr().tocsc())
             except RuntimeError as error:
                 raise FactorError(f"the coarse problem of a face with friction: {error}") from error
 

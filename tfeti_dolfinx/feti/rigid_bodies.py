@@ -8,18 +8,16 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from mpi4py import MPI
 from scipy.linalg import qr
 from scipy.sparse import (
     csc_array,
     csr_array,
     hstack,
-    vstack,
 )
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import Array, submatrix
-from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.arrays import Array, Entries, entries_at, entries_of_rows, entries_within
+from tfeti_dolfinx.common.parallel import bcast_from_root, rows_over
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
@@ -59,6 +57,8 @@ class MotionTolerances:
 
 
 TOLERANCES = MotionTolerances()
+# bodies that meet, numbered as in ``gram_of``, and k × k blocks
+Pairs = tuple[Array, Array]
 
 # --- Dense algebra on parts of sparse matrices with few columns -------------------------------
 
@@ -94,11 +94,13 @@ def on_rows(parts: list[tuple[Array, Array]], n: int) -> csr_array:
     ]
     column = np.concatenate([np.tile(columns, count) for count, columns in own])
     values = np.concatenate([dense.ravel() for _, dense in parts])
-    return csr_array((values, (row, column)), shape=(n, int(starts[-1])))
+    return entries_at(row, column, values, (n, int(starts[-1]))).csr()
 
 
 def orthonormal_columns(A: csr_array) -> csr_array:
     """Return an orthonormal basis of the span of independent columns, part by part."""
+    if not A.shape[1]:
+        return A
     parts = [(rows, np.linalg.qr(dense)[0]) for _, rows, dense in parts_of_columns(A)]
     return on_rows(parts, A.shape[0])
 
@@ -133,7 +135,9 @@ class Motions:
     @cached_property
     def alone(self) -> csr_array:
         """The motions of single bodies as columns, shape ``(bodies * k, a)``."""
-        return submatrix(block_diagonal(self.single), slice(None), np.flatnonzero(self.free))
+        return entries_within(
+            block_diagonal(self.single), slice(None), np.flatnonzero(self.free)
+        ).csr()
 
     @property
     def count(self) -> int:
@@ -141,11 +145,11 @@ class Motions:
         return int(self.free.sum()) + self.joint.shape[1]
 
 
-def block_diagonal(blocks: Array) -> csr_array:
+def block_diagonal(blocks: Array) -> Entries:
     """Square blocks of shape ``(n, k, k)`` as one sparse matrix."""
     n, k = blocks.shape[:2]
     columns = np.repeat(np.arange(n * k).reshape(n, k), k, axis=0).ravel()
-    return csr_array((blocks.ravel(), columns, k * np.arange(n * k + 1)), shape=(n * k, n * k))
+    return Entries(blocks.ravel(), columns, k * np.arange(n * k + 1), (n * k, n * k))
 
 
 def unsprung(shares: Array) -> Motions:
@@ -158,7 +162,7 @@ def unsprung(shares: Array) -> Motions:
     return Motions(vectors, values < 0.5, values, none)
 
 
-def unresisted(gram: csr_array, within: Motions, below: float = TOLERANCES.null) -> Motions:
+def unresisted(grams: Sequence[Pairs], within: Motions, below: float = TOLERANCES.null) -> Motions:
     """Return motions of a space of single bodies' motions that rows do not resist.
 
     1. Scale: the stiffest motion of each body is 1, and what is not in the space is left out.
@@ -167,13 +171,16 @@ def unresisted(gram: csr_array, within: Motions, below: float = TOLERANCES.null)
        connected components of bodies.
 
     Args:
-        gram: JᵀJ of the rows, shape ``(bodies * k,) * 2``.
+        grams: JᵀJ of the rows, as ``gram_of`` has it, to be added up.
         within: The space to look in; its joint motions are not looked at.
         below: Motions of a single body held by less than this share of its stiffest motion are
             taken in too; those of several bodies must be free (and may have parts in those).
     """
     V, free, null = within.single, within.free, TOLERANCES.null
-    i, j, blocks = _blocks_of(gram, len(V), free.shape[1])
+    pairs, which = np.unique(np.concatenate([pairs for pairs, _ in grams]), return_inverse=True)
+    i, j = np.divmod(pairs, max(len(V), 1))
+    blocks = np.zeros((len(pairs), *V.shape[1:]))
+    np.add.at(blocks, which, np.concatenate([part for _, part in grams]))
 
     def between(U: Array, A: Array) -> Array:
         return np.asarray(np.swapaxes(U[i], 1, 2) @ A @ U[j])
@@ -209,14 +216,26 @@ def unresisted(gram: csr_array, within: Motions, below: float = TOLERANCES.null)
     )
 
 
-def _blocks_of(A: csr_array, n: int, k: int) -> tuple[Array, Array, Array]:
-    """Rows and columns of k × k blocks of a sparse matrix that has n of them, and the blocks."""
-    entries = A.tocoo()
-    row, column = (index.astype(np.int64) for index in entries.coords)
-    places, which = np.unique(row // k * n + column // k, return_inverse=True)
-    blocks = np.zeros((len(places), k, k))
-    np.add.at(blocks, (which, row % k, column % k), entries.data)
-    return places // max(n, 1), places % max(n, 1), blocks
+def gram_of(J: csr_array, some: Array, n: int, k: int) -> Pairs:
+    """JᵀJ of flagged rows on k motions of n bodies each: pairs i n + j that meet, their blocks."""
+    row = np.repeat(np.arange(J.shape[0]), np.diff(J.indptr))
+    kept = some[row]
+    body, motion = np.divmod(J.indices[kept].astype(np.int64), k)
+    met, which = np.unique(row[kept] * n + body, return_inverse=True)
+    parts = np.zeros((len(met), k))
+    parts[which, motion] = J.data[kept]
+    # all bodies of a row with each of them
+    row, body = np.divmod(met, max(n, 1))
+    first, last = np.searchsorted(row, row), np.searchsorted(row, row, side="right")
+    count = last - first
+    left = np.repeat(np.arange(len(met)), count)
+    right = np.arange(len(left)) - np.repeat(np.cumsum(count) - last, count)
+    pairs, which = np.unique(body[left] * n + body[right], return_inverse=True)
+    blocks = np.zeros((len(pairs), k, k))
+    for a, b in np.ndindex(k, k):
+        products = parts[left, a] * parts[right, b]
+        blocks[:, a, b] = np.bincount(which, products, minlength=len(pairs))
+    return pairs, blocks
 
 
 def _null_space(blocks: Array, i: Array, j: Array, held: Array) -> Iterator[tuple[Array, Array]]:
@@ -253,8 +272,6 @@ class Bodies:
 
     Args:
         subdomains: This rank's Blocks. The constructor is collective.
-        first: This rank's first kernel coordinate.
-        dimension: Kernel coordinates of all ranks, r.
 
     Attributes:
         count: Number of bodies on all ranks.
@@ -268,7 +285,7 @@ class Bodies:
             shape ``(bodies,)``.
     """
 
-    def __init__(self, subdomains: Subdomains, first: int, dimension: int) -> None:
+    def __init__(self, subdomains: Subdomains) -> None:
         self._subdomains, comm = subdomains, subdomains.comm
         self.count, self.k = subdomains.num_bodies, subdomains.num_modes
         metric = subdomains.modes_metric()
@@ -276,8 +293,8 @@ class Bodies:
         W = self.frames = bcast_from_root(comm, _frames(metric / self.nodes[:, None, None]))
         shares = np.swapaxes(W, 1, 2) @ subdomains.modes_outside() @ W
         self.unsprung = bcast_from_root(comm, unsprung(shares))
-        inside = _replicated(subdomains.modes_in_kernel, first, dimension, comm)
-        self.motions = inside @ block_diagonal(self.frames)
+        inside = rows_over(comm, subdomains.modes_in_kernel).csr()
+        self.motions = inside @ block_diagonal(self.frames).csr()
         self.update_load()
 
     def update_load(self) -> None:
@@ -305,15 +322,6 @@ def _frames(gram: Array) -> Array:
     extent = values > TOLERANCES.dependent * values.max(axis=1, initial=0.0, keepdims=True)
     roots = np.where(extent, values, 1.0) ** -0.5
     return np.asarray((vectors * roots[:, None, :]) @ np.swapaxes(vectors, 1, 2))
-
-
-def _replicated(local: csr_array, first: int, dimension: int, comm: MPI.Intracomm) -> csr_array:
-    """Return the rows of all ranks, on every rank; this rank's begin at first."""
-    entries = local.tocoo()
-    row, column = entries.coords
-    every = ((first + row).astype(np.int64), column.astype(np.int64), entries.data)
-    rows, columns, values = (np.concatenate(comm.allgather(part)) for part in every)
-    return csr_array((values, (rows, columns)), shape=(dimension, local.shape[1]))
 
 
 # --- Basis of the kernel with the bodies' motions ---------------------------------------------
@@ -356,7 +364,12 @@ class KernelBasis:
     def coordinates(self, X: csr_array) -> csr_array:
         """T⁻¹X."""
         first = self.inverse @ X[self.pins]
-        return vstack([first, X[self.rest] - self.motions[self.rest] @ first], format="csr")
+        left = csr_array(X - self.motions @ first)
+        entries, table = entries_of_rows(left, self.rest)
+        data = np.concatenate((first.data, left.data[entries]))
+        columns = np.concatenate((first.indices, left.indices[entries]))
+        table = np.concatenate((first.indptr, first.indptr[-1] + table[1:]))
+        return Entries(data, columns, table, X.shape).csr()
 
     def rows(self, Gt: csr_array, J: csr_array, equalities: Array) -> csr_array:
         """Gᵀ T from Gᵀ and its rows J on motions of bodies, what is known to be zero left out."""
@@ -365,7 +378,7 @@ class KernelBasis:
         zero = np.where(of_equalities, self.unheld[GtM.indices], self.free[GtM.indices])
         GtM.data[zero] = 0.0
         GtM.eliminate_zeros()
-        return hstack([GtM, submatrix(Gt, slice(None), self.rest)], format="csr")
+        return hstack([GtM, entries_within(Gt, slice(None), self.rest).csr()], format="csr")
 
 
 def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
@@ -380,13 +393,13 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     # eigenvalues: free −2, held by contact −1, by equality rows 0, by springs 3
     values, V = np.linalg.eigh(3.0 * (np.eye(bodies.k) - of_unsprung) - of_unheld - of_free)
     kept = values < 1.5
-    i, j, blocks = _blocks_of(bodies.motions.T @ bodies.motions, bodies.count, bodies.k)
-    size = np.zeros(V.shape)
-    size[i[i == j]] = blocks[i == j]
+    every, size = np.ones(bodies.motions.shape[0], dtype=bool), np.zeros(V.shape)
+    pairs, blocks = gram_of(bodies.motions, every, bodies.count, bodies.k)
+    size[pairs // max(bodies.count, 1)] = blocks  # a coordinate is of one body
     gram = np.swapaxes(V, 1, 2) @ size @ V
     gram = np.where(kept[:, :, None] & kept[:, None, :], gram, np.eye(bodies.k))
     directions = V @ np.linalg.inv(np.swapaxes(np.linalg.cholesky(gram), 1, 2))
-    combined = submatrix(block_diagonal(directions), slice(None), np.flatnonzero(kept))
+    combined = entries_within(block_diagonal(directions), slice(None), np.flatnonzero(kept)).csr()
     motions = bodies.motions @ combined
     body = np.repeat(np.arange(bodies.count), kept.sum(axis=1))
     pins, inverse = _pins(motions.tocsc(), body)

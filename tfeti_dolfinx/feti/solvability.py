@@ -198,17 +198,17 @@ def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
 def check_solvable(
     coarse: CoarseSpace,
     constraints: Constraints,
+    load: Array,
     body_names: Sequence[str],
     mode_names: Sequence[str],
 ) -> None:
     """Raise if the load moves a body that neither contact nor friction can hold. Collective.
 
+    ``load`` is its work on each motion of the bodies.
+
     Raises:
         NoSolutionError: Names the body, the motion, and what friction would have to hold.
     """
-    if coarse.dimension == 0:
-        return
-    load = coarse.motions.T @ coarse.e
     motion = bcast_from_root(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
     reason = (
         "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
@@ -277,6 +277,8 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
 
 def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
     """Return the part of the load on free motions, if it is more than rounding."""
+    if not free.count:
+        return None
     alone = (free.alone @ (free.alone.T @ load)).reshape(bodies.count, bodies.k)
     alone[np.linalg.norm(alone, axis=1) <= bodies.negligible] = 0.0
     if np.any(alone):

@@ -66,7 +66,8 @@ class Coarse:
     @cached_property
     def moduli(self) -> LocalMatrix:
         """The moduli of its entries."""
-        return LocalMatrix(abs(self.Gt))
+        entries = self.rows.entries()
+        return LocalMatrix(entries._replace(data=np.abs(entries.data)))
 
     def G(self, x: Array) -> Array:
         """G_fZᵀx, replicated."""

@@ -52,7 +52,7 @@ class CholeskyFactor:
     """A = L Lᵀ of a symmetric positive definite matrix on one rank.
 
     Args:
-        A: scipy sparse matrix, both triangles, shape ``(n, n)``; not needed any more after it.
+        A: scipy sparse matrix or ``Entries``, both triangles, shape ``(n, n)``; may go after it.
         prefix: Prefix of the PETSc options ``pc_factor_...`` and ``mat_...`` that it heeds.
 
     Raises:

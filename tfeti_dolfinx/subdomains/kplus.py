@@ -73,7 +73,10 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
 
 
 def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
-    """K_ρ, scipy CSR as K; K itself where R has no columns. The fixing unknowns ascend."""
+    """K_ρ, scipy CSR as K; K itself, maybe ``Entries``, where R has no columns.
+
+    The fixing unknowns ascend.
+    """
     if R.shape[1] == 0:
         return K
     Q, _ = np.linalg.qr(R[fixing_dofs])

@@ -19,7 +19,6 @@ from tfeti_dolfinx.common.arrays import (
     LocalMatrix,
     entries_of_rows,
     entries_within,
-    submatrix,
 )
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
@@ -150,11 +149,11 @@ class Traced:
         # the triangle has the null space of the kernel's trace rows, and few rows itself
         triangle = np.linalg.qr(stiffness.kernel[self.trace], mode="r")
         R = stiffness.kernel[inside] @ null_space(triangle, rcond=TOLERANCES.on_trace)
-        how, K_ii = stiffness.how, submatrix(stiffness.K, inside, inside)
+        how, K_ii = stiffness.how, entries_within(stiffness.K, inside, inside)
         how.counters.factorizations += 1
         try:
             fixing = fixing_dofs(stiffness.x, inside // stiffness.bs)
-            return regularised(K_ii, R, fixing, how.prefix)
+            return regularised(K_ii.csr() if R.shape[1] else K_ii, R, fixing, how.prefix)
         except FactorError as error:
             raise FactorError(
                 f"{stiffness.name}: the stiffness of the unknowns that no row touches, for the "

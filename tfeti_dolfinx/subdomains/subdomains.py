@@ -8,10 +8,11 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import (
     Array,
+    entries_at,
     entries_of_rows,
     joined,
     node_blocks,
@@ -213,8 +214,10 @@ class Subdomains:
         found = [_outside_motions(block) for block in self.blocks]
         pairs = list(zip(self.blocks, found, strict=True))
         trace = [R[block.trace_dofs] for block, (R, _) in pairs]
-        rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
-        return SoftMotions(rows, joined([D for _, D in found]))
+        begins = np.cumsum([0, *(part.shape[1] for part in trace)])
+        rows = [part.start for part in self.trace_parts]
+        of_trace = _assembled(trace, rows, list(begins[:-1]), (len(self.trace), int(begins[-1])))
+        return SoftMotions(of_trace, joined([D for _, D in found]))
 
     # ------------------------------------------------------- rigid bodies' unknowns
 
@@ -340,7 +343,7 @@ def _assembled(
         places.append(np.stack(((row + i).ravel(), (column + j).ravel())))
         values.append(part.ravel())
     row_of, column_of = np.concatenate(places, axis=1)
-    return csr_array((joined(values), (row_of, column_of)), shape=shape)
+    return entries_at(row_of, column_of, joined(values), shape).csr()
 
 
 # --- From the forms to the Blocks -------------------------------------------------------------
