@@ -112,8 +112,8 @@ def linear_problem(made, solution):
     A = untorn(K, dofs)
     b = A.createVecRight()
     load = dofs.to_primal(f).reshape(-1, dofs.bs)
-    b.array[:] = dofs.reduce(load, np.add, 0.0).ravel()
-    u = dofs.reduce(solution.u.reshape(-1, dofs.bs), np.maximum, -np.inf)
+    b.array[:] = dofs.reduce(load, np.add).ravel()
+    u = dofs.reduce(solution.u.reshape(-1, dofs.bs), np.maximum)
     prescribed = solution.gluing.prescribed
     held = prescribed.flag.copy()
     held[solution.gluing.records.group[solution.force > 0.0]] = True
@@ -155,7 +155,7 @@ def rigid_motions(A, dofs):
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, : dofs.bs]
     points = A.createVecRight()
     points.setBlockSize(dofs.bs)
-    points.array[:] = dofs.reduce(x, np.maximum, -np.inf).ravel()
+    points.array[:] = dofs.reduce(x, np.maximum).ravel()
     return PETSc.NullSpace().createRigidBody(points)
 
 

@@ -80,9 +80,9 @@ class Options:
     pc_type: str = described(
         "auto",
         "all",
-        "preconditioner, with contact on the free rows alone; auto takes dirichlet, and none with "
-        "smalse",
-        choices=("auto", "none", *PRECONDITIONERS),
+        "preconditioner, with contact on the free rows alone; auto takes dirichlet, after steps of "
+        "lumped where subdomains are large, and none with smalse",
+        choices=("none", *PRECONDITIONERS),
     )
     scaling: str = described(
         "stiffness",

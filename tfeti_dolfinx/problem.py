@@ -43,6 +43,7 @@ from tfeti_dolfinx.saved_state import SavedState, check_state
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude
+from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod
 from tfeti_dolfinx.system import Settings, System
 
@@ -274,8 +275,9 @@ class ContactProblem:
             goal = None
             if options.rtol == "auto" and self._stress is not None:
                 goal = goal_of(self._stress, self.dofs, self._thickness)
-            own = self._settings.extensions.monitor
-            solved = solve_with_friction(dual, options, options.qp_type, start, own, goal)
+            given, own = self._settings, self._settings.extensions.monitor
+            with added_options(given.prefix, given.factor_options):  # of faces, and of a late S
+                solved = solve_with_friction(dual, options, options.qp_type, start, own, goal)
         result, accuracy, settling = solved
         # 2. their displacement
         with stage("recovery", seconds):

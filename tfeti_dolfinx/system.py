@@ -161,6 +161,9 @@ class Settings:
                 recycle=options.recycle,
                 dimension=gdim,
             )
+        if options.pc_type == "auto":
+            late = "" if dual.late is None else "late "
+            options = replace(options, pc_type=f"{late}dirichlet")
         return dual, options
 
 

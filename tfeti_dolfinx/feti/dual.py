@@ -17,7 +17,9 @@ from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.deflation import Deflation, MakeDeflation, SoftModes, mean_stiffness
 from tfeti_dolfinx.feti.operator import (
     DualOperator,
+    LateDirichlet,
     MakePreconditioner,
+    chosen_preconditioner,
     dirichlet_preconditioner,
     scaled_rows,
 )
@@ -105,7 +107,7 @@ class Dual:
     Attributes:
         F: B K⁺ Bᵀ.
         d: B K⁺ f − c, this rank's part.
-        preconditioner: The preconditioner, or None.
+        preconditioner: The preconditioner, or None; ``late``: itself, where it may change.
         coarse: The coarse space.
         soft: Motions that springs hold softly, or of subdomains in clusters, for the
             preconditioner; None without one.
@@ -151,16 +153,18 @@ class Dual:
         self.F = DualOperator(B, subdomains.local_operator("pinv"))
         self.preconditioner: DualOperator | None = None
         self._scaled: PETSc.Mat | None = None
+        own = preconditioner in (dirichlet_preconditioner, chosen_preconditioner)
         if preconditioner is not None:
             self._scaled = scaled_rows(B, constraints.weights)
-            plain = preconditioner is dirichlet_preconditioner and "smooth_displacements" in without
+            plain = own and "smooth_displacements" in without
             self.preconditioner = (
                 DualOperator(self._scaled, subdomains.local_operator("schur"))
                 if plain
                 else preconditioner(self._scaled, subdomains)
             )
         self._lifting: LocalOperator | None = None
-        if self.preconditioner is not None and preconditioner is dirichlet_preconditioner:
+        self.late = self.preconditioner if isinstance(self.preconditioner, LateDirichlet) else None
+        if self.preconditioner is not None and own and self.late is None:
             self._lifting = self.preconditioner.local
         self._on_faces: FacePreconditioner | None = None
         self._on_all: FaceOperator | None = None
@@ -216,17 +220,23 @@ class Dual:
             self._held_load = load / size
 
     def learn(self) -> None:
-        """Keep directions from now on, where options leave that open: more solves come."""
+        """More solves come: keep directions, where options leave that open, and let S pay."""
         if self._learns and self.recycled is None:
             self.recycled = Recycled(LIMITS.recycled, self.coarse.comm)
+        if self.late is not None:
+            self.late.steps = 0
 
     @property
     def lifting(self) -> LocalOperator:
-        """S of this rank's subdomains: that of the Dirichlet preconditioner, or made for it.
+        """S of this rank's subdomains: that of the preconditioner, or made for it.
 
         Raises:
             FactorError: The stiffness inside of a subdomain could not be factored.
         """
+        if self.late is not None:
+            self.late.steps = 0
+            self.late.settle()
+            self._lifting = self.late.local
         if self._lifting is None:
             made = self.subdomains.local_operator("schur", once=True)
             with raised_on_all_ranks(self.coarse.comm):
@@ -303,7 +313,8 @@ class Dual:
     @property
     def _on_all_rows(self) -> Operator | None:
         """Return the preconditioner on all rows, made once."""
-        smooths = self.preconditioner is not None and self.preconditioner.metric is not None
+        given = self.preconditioner
+        smooths = given is not None and (given is self.late or given.metric is not None)
         count = 0 if self.soft is None else self.soft.count
         if not (count or (smooths and not any(self.contact_rows))):
             return self.preconditioner

@@ -75,6 +75,26 @@ class Metric:
     hard: bool
 
 
+@dataclass(frozen=True)
+class PreconditionerChoice:
+    """Choice of the preconditioner.
+
+    Attributes:
+        dear: Mean entries of a column of a subdomain's factor, from which on S is dear: to make it
+            takes as long as a twentieth of so many multiplications by F.
+        steps: Multiplications by the lumped one, beyond which S pays: friendly scenes have taken 26
+            to 40 to 1e-6.
+        volume: (λ + 2μ)/μ, 20 of ν = 0.474, from which on what is inside has to follow a trace.
+    """
+
+    dear: float = 190.0
+    steps: int = 60
+    volume: float = 20.0
+
+
+CHOICE = PreconditionerChoice()
+
+
 class DualOperator:
     """B diag(A_s) Bᵀ, diag(A_s) local to the ranks, with a count of multiplications.
 
@@ -145,11 +165,11 @@ def scaled_rows(B: PETSc.Mat, weights: Array) -> PETSc.Mat:
 
 
 def dirichlet_preconditioner(
-    B: PETSc.Mat, subdomains: Subdomains, volume: float = 20.0
+    B: PETSc.Mat, subdomains: Subdomains, volume: float = CHOICE.volume
 ) -> DualOperator:
     """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; with a metric if sparse. Collective.
 
-    From (λ + 2μ)/μ of ``volume`` on, 20 of ν = 0.474, what is inside has to follow a trace.
+    From (λ + 2μ)/μ of ``volume`` on what is inside has to follow a trace.
     """
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     metric, comm = None, subdomains.comm
@@ -162,9 +182,51 @@ def dirichlet_preconditioner(
     return DualOperator(B, subdomains.local_operator("schur"), metric)
 
 
+class LateDirichlet(DualOperator):
+    """The lumped preconditioner, until it has taken ``steps``; then that of Dirichlet.
+
+    Directions of PCPG and of conjugate residuals are kept, so they go on through the change.
+
+    Attributes:
+        steps: Multiplications by the lumped one; 0: S pays, as more solves come.
+    """
+
+    def __init__(self, B: PETSc.Mat, subdomains: Subdomains) -> None:
+        super().__init__(B, subdomains.local_operator("stiffness"))
+        self.steps, self._subdomains = CHOICE.steps, subdomains
+
+    def settle(self) -> None:
+        """Make S where it is time. Collective.
+
+        Raises:
+            FactorError: The stiffness inside of a subdomain could not be factored.
+        """
+        if self.metric is None and self.times >= self.steps:
+            made = dirichlet_preconditioner(self.B, self._subdomains)
+            self.local, self.metric = made.local, made.metric
+            made.destroy()
+
+
+def chosen_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
+    """Dirichlet's, or a late one where S is dear. Collective.
+
+    Where a subdomain keeps its volume, or springs hold one, the lumped one takes many times as many
+    steps; there, in clusters, and beside other Blocks it is Dirichlet's.
+    """
+    sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
+    other = subdomains.num_clusters > 0 or len(sparse) < len(subdomains.elastic)
+    dear = any(block.stiffness.entries > CHOICE.dear * block.stiffness.size for block in sparse)
+    held = any(block.kernel.shape[1] < block.modes.shape[1] for block in sparse)
+    stiff = any(block.stiffness.stretch_over_shear > CHOICE.volume for block in sparse)
+    if any_rank(subdomains.comm, dear) and not any_rank(subdomains.comm, other or held or stiff):
+        return LateDirichlet(B, subdomains)
+    return dirichlet_preconditioner(B, subdomains)
+
+
 MakePreconditioner = Callable[[PETSc.Mat, Subdomains], DualOperator]
 PRECONDITIONERS: dict[str, MakePreconditioner] = {
     # B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D
     "lumped": lambda B, subdomains: DualOperator(B, subdomains.local_operator("stiffness")),
     "dirichlet": dirichlet_preconditioner,
+    "auto": chosen_preconditioner,
 }

@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.parallel import bcast_from_root, joined_over, largest,
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import side_by_side
-from tfeti_dolfinx.feti.operator import DualOperator, Metric
+from tfeti_dolfinx.feti.operator import DualOperator, LateDirichlet, Metric
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
@@ -103,8 +103,17 @@ class FacePreconditioner:
         self._size = _diagonal(whole.B, diagonal)
         self.work, self.jumps = whole.B.createVecs()
         self.weights, self.steps = constraints.weights, list[tuple[float, float]]()
-        if whole.metric is not None:
-            self._smooth_in(whole.metric, diagonal)
+        self._metric: Metric | None = None
+        self._diagonal = diagonal
+        self.settle()
+
+    def settle(self) -> None:
+        """Follow what the operator on all rows becomes. Collective."""
+        if isinstance(self.whole, LateDirichlet):
+            self.whole.settle()
+        if (metric := self.whole.metric) is not self._metric and metric is not None:
+            self._metric = metric
+            self._smooth_in(metric, self._diagonal)
 
     def _smooth_in(self, metric: Metric, diagonal: Array) -> None:
         """Choose the steps by a bound of the largest eigenvalue of D⁻¹K. Collective."""
@@ -195,6 +204,7 @@ class _OnFace:
     def __call__(self, x: Array) -> Array:
         """M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
         on, moves, sizes = self._on_all, self._moves, self._sizes
+        on.settle()
         B, w, y, D = on.whole.B, on.work, on.jumps, on.weights
         trace, size = w.getLocalSize(), len(D)
         solved = self._face.restricted if self._is_identity else self._solved

@@ -42,7 +42,7 @@ SOLVERS = {
         solve_by_pcpg,
         PcpgParameters(),
         keeps_sets=False,
-        pc_type="dirichlet",
+        pc_type="auto",
         relative_to_norm=False,
         # the nearest solution of Gλ̄ = e: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ)
         warm=lambda qp, start: qp.coarse.project(start.lam) + qp.coarse.particular(),
@@ -58,7 +58,7 @@ SOLVERS = {
         newton,
         NewtonParameters(),
         keeps_sets=True,
-        pc_type="dirichlet",
+        pc_type="auto",
         relative_to_norm=False,
         cold=first_point,
         warm=feasible_start,

@@ -1,0 +1,116 @@
+"""Where the Schur complements are dear to make, the lumped preconditioner begins a solve."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+from scenes import curved_obstacle, decomposed, problem
+from test_repeated import Repeated
+
+import tfeti_dolfinx as tfeti
+from benchmarks.stability_scenes import flat_block
+from benchmarks.stress.judge import run_scene
+from tfeti_dolfinx.feti import operator
+from tfeti_dolfinx.subdomains import sparse_block
+
+SUBDOMAINS = 4
+
+
+def block(contact=True, n=4, **options):
+    """A clamped block of subdomains that do not share their factors."""
+    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.2)] if contact else []
+    d = decomposed("hexahedron", n, SUBDOMAINS)
+    return problem(d, contacts=obstacles, tfeti_local_type="implicit", **options)
+
+
+def solved(*given, **options):
+    """Solver, factorisations of a subdomain, multiplications by S and displacement of a block."""
+    p = block(*given, **options)
+    p.solve()
+    report, u = p.report, p.solution.u
+    p.destroy()
+    factors = report.factorizations // SUBDOMAINS
+    return report.solver, factors, report.preconditioner_multiplications, u
+
+
+def apart(u, other):
+    comm = MPI.COMM_WORLD
+    return comm.allreduce(np.abs(u - other).max(initial=0.0), op=MPI.MAX)
+
+
+@pytest.fixture
+def late(monkeypatch):
+    """S is dear everywhere, and pays after so many multiplications."""
+
+    def after(steps):
+        choice = replace(operator.CHOICE, dear=0.0, steps=steps)
+        monkeypatch.setattr(operator, "CHOICE", choice)
+
+    return after
+
+
+@pytest.mark.parametrize("contact", [True, False])
+def test_S_comes_after_some_multiplications_and_the_answer_is_the_same(contact, late):
+    _, _, fewest, u = solved(contact, tfeti_pc_type="dirichlet", tfeti_rtol=1e-9)
+    _, _, most, _ = solved(contact, tfeti_pc_type="lumped", tfeti_rtol=1e-9)
+    for steps, factors in ((0, 2), (4, 2), (1000, 1)):
+        late(steps)
+        solver, made, count, found = solved(contact, tfeti_rtol=1e-9)
+        assert solver == f"{'newton' if contact else 'pcpg'} + late dirichlet"
+        assert made == factors
+        assert apart(found, u) <= 1e-7 * np.abs(u).max()
+        assert count == {0: fewest, 1000: most}.get(steps, count)
+        assert count <= most
+
+
+def test_more_solves_make_S_as_soon_as_they_multiply_by_it(late):
+    late(1000)
+    scene = Repeated(local_type="implicit")
+    scene.solve()
+    report = scene.problem.report
+    count, first = report.factorizations, report.preconditioner_multiplications
+    scene.solve()
+    assert scene.problem.report.factorizations == 0
+    scene.solve(load=-0.08)
+    assert scene.problem.report.factorizations == count
+    assert 0 < scene.problem.report.preconditioner_multiplications < first
+    assert apart(scene.problem.solution.u, scene.fresh(load=-0.08).u) <= 1e-8
+    scene.problem.destroy()
+
+
+def test_it_is_chosen_for_large_subdomains_in_space_alone():
+    """Not for a few cells, not for what is asked for, not beside springs."""
+    names = [
+        solved(True, 16)[0],
+        solved(True, 4)[0],
+        solved(True, 16, tfeti_pc_type="dirichlet")[0],
+        solved(True, 16, springs=0.1)[0],
+    ]
+    assert names == ["newton + late dirichlet", *["newton + dirichlet"] * 3]
+
+
+def test_factors_that_come_late_read_the_options_of_the_problem(late, monkeypatch):
+    late(4)
+    given, name, seen = sparse_block.regularised, "pc_factor_mat_solver_type", []
+
+    def watched(K, R, fixing, prefix):
+        seen.append(PETSc.Options(prefix).getString(name, "none"))
+        return given(K, R, fixing, prefix)
+
+    monkeypatch.setattr(sparse_block, "regularised", watched)
+    solved(tfeti_sub_pc_factor_mat_solver_type="mumps")
+    assert seen
+    assert set(seen) == {"mumps"}
+
+
+def test_what_rounding_stops_begins_again_with_S(serial_only, late):
+    """Cells 10 000 times as wide as high: on more ranks rounding stops S, too."""
+    scene = flat_block("tetrahedron", 1e4)
+    lumped = replace(scene, options={**scene.options, "tfeti_pc_type": "lumped"})
+    late(1000)
+    assert "DIVERGED_ROUNDING" in run_scene(lumped, MPI.COMM_WORLD)["error"]
+    found = run_scene(scene, MPI.COMM_WORLD)
+    assert found["error"] == ""
+    assert found["u"] <= 1e-6
