@@ -143,7 +143,11 @@ class Diagnostics:
         if self._of is None or self._of() is not dual:
             lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
-            self._slopes = self._make_slopes(dual.subdomains)
+            # mean slopes of a displacement of each subdomain, (gdim, nodes)
+            x, bs = self._points(dual.subdomains), self._dofs.bs
+            parts = [p for _, p in dual.subdomains.elastic_parts]
+            nodes = [x[p.start // bs : p.stop // bs] for p in parts]
+            self._slopes = [np.linalg.pinv(own, EPSILON * len(x)) for own in nodes]
         u = solution.u
         return [
             *_loose(outcome),
@@ -271,12 +275,6 @@ class Diagnostics:
                     f"the largest pressure presses elements together by {largest * most[1]:.2g}; "
                     'expected gap="curved", a mesh of degree 2, or smaller facets'
                 )
-
-    def _make_slopes(self, subdomains: Subdomains) -> list[Array]:
-        """Return what gives the mean slopes of a displacement of each subdomain, (gdim, nodes)."""
-        x, bs = self._points(subdomains), self._dofs.bs
-        parts = [slice(p.start // bs, p.stop // bs) for _, p in subdomains.elastic_parts]
-        return [np.linalg.pinv(x[part], EPSILON * len(x)) for part in parts]
 
     def _points(self, subdomains: Subdomains) -> Array:
         """Return points of this rank's primal nodes, from the middle of their subdomains on."""

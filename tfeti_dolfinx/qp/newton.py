@@ -422,14 +422,6 @@ class FaceSolver:
         apart = self._qp.feasible.project(z.lam) - z.lam
         return any_rank(self._qp.comm, (apart != 0.0) & (self._face.status != Status.SLIP))
 
-    def _to_a_bound(self, lam: Array, way: Array) -> float:
-        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way."""
-        assert self._face is not None
-        qp, held = self._qp, np.where(self._face.status == Status.SLIP, 0.0, way)
-        small = self._parameters.rounding * largest(qp.comm, way)
-        own = qp.feasible.max_step(lam, -np.where(np.abs(held) > small, held, 0.0))
-        return least(qp.comm, max(own, 0.0))
-
     def _along_null_space(self, z: Point) -> Point:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
@@ -437,13 +429,18 @@ class FaceSolver:
         on each other want gaps that exclude each other: ``excluding`` says so.
         """
         own, qp, given = self.directions, self._qp, self._parameters
+        assert self._face is not None
         for way in (own.p, own.r):
             size, Fw = largest(qp.comm, way), qp.F(way)
             curvature, square = qp.dot((way, Fw), (way, way))
             if size == 0.0 or own.seen(curvature, square):
                 continue
             way, Fw = self._unseen(way, Fw)
-            length = self._to_a_bound(z.lam, way)
+            # to the first bound, maybe infinite; rounding ends no way
+            small = given.rounding * largest(qp.comm, way)
+            moves = (self._face.status != Status.SLIP) & (np.abs(way) > small)
+            bound = qp.feasible.max_step(z.lam, -np.where(moves, way, 0.0))
+            length = least(qp.comm, max(bound, 0.0))
             if np.isfinite(length):
                 step = given.beyond * length
                 return Point(z.lam + step * way, z.g + step * Fw)

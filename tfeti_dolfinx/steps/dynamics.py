@@ -64,12 +64,14 @@ def balance(
     u, v = solution.displacement.x.array, solution.velocity.x.array
     start, way = motion.start, u - motion.u
     kicked = motion.towards - motion.u - motion.size * start
+    sets, primal = dual.constraints.sets, solution.dofs.to_primal(way)
+    done = -solution.lam * dual.constraints.jumps(primal[dual.subdomains.trace])  # −λᵀB Δu
     own = [
         0.5 * v @ (M @ v),
         forms.elastic(u),
         0.5 * motion.v @ (M @ motion.v) + forms.elastic(motion.u),
         0.5 * (motion.load + inertia.ends) @ way,
-        *_work_of_rows(dual, solution.lam, solution.dofs.to_primal(way)),
+        *(done[rows].sum() for rows in (sets.normals, sets.tangents.ravel(), sets.equalities)),
         0.5 * (start @ (M @ start) - motion.v @ (M @ motion.v))
         - 2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
     ]
@@ -83,14 +85,6 @@ def balance(
         **dict(zip(NAMES, work, strict=True)),
         "defect": kinetic + elastic - before - sum(work),
     }
-
-
-def _work_of_rows(dual: Dual, lam: Array, way: Array) -> list[float]:
-    """−λᵀB Δu of this rank's normal, tangential and other rows. Collective."""
-    sets = dual.constraints.sets
-    done = -lam * dual.constraints.jumps(way[dual.subdomains.trace])
-    kinds = (sets.normals, sets.tangents.ravel(), sets.equalities)
-    return [float(done[kind].sum()) for kind in kinds]
 
 
 # --- Predictor: projection in M onto admissible displacements ---------------------------------
