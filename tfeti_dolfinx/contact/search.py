@@ -13,11 +13,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
-from tfeti_dolfinx.contact.records import (
-    ContactRecords,
-    concatenate,
-    relative_displacement,
-)
+from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import diameter, surface_nodes

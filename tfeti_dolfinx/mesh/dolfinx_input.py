@@ -195,8 +195,7 @@ def _untorn(
         node_ids=np.asarray(mesh.geometry.input_global_indices),
         x=mesh.geometry.x[:, : mesh.geometry.dim],
         names=PhysicalNames(
-            surfaces=_names(mesh, facet_tags, surfaces),
-            volumes=_names(mesh, cell_tags, volumes),
+            surfaces=_names(mesh, facet_tags, surfaces), volumes=_names(mesh, cell_tags, volumes)
         ),
     )
 

@@ -151,10 +151,7 @@ class LawProgram:
 
 
 def newton_on_law(
-    program: LawProgram,
-    at: LawPoint,
-    target: float,
-    parameters: FrictionParameters = DEFAULT,
+    program: LawProgram, at: LawPoint, target: float, parameters: FrictionParameters = DEFAULT
 ) -> tuple[LawPoint | None, int]:
     """Solve the natural map of Coulomb's law by a semismooth Newton method. Collective.
 

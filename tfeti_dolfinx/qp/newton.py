@@ -23,12 +23,7 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.projection import (
-    UNBALANCED,
-    FeasiblePoint,
-    WithinFace,
-    project_onto_feasible,
-)
+from tfeti_dolfinx.qp.projection import UNBALANCED, FeasiblePoint, WithinFace, project_onto_feasible
 from tfeti_dolfinx.qp.sets import Face, Status
 
 # least status of rows with friction

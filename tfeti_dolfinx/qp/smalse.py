@@ -39,12 +39,7 @@ class SmalseParameters:
     """
 
     rho: float = described(
-        1.0,
-        "smalse",
-        "penalty ρ in units of ‖PFP‖",
-        name="smalse_rho",
-        symbol="ρ",
-        fits=ABOVE_0,
+        1.0, "smalse", "penalty ρ in units of ‖PFP‖", name="smalse_rho", symbol="ρ", fits=ABOVE_0
     )
     M: float = described(
         1.0, "smalse", "M₀ in units of ‖PFP‖", name="smalse_M", symbol="M", fits=ABOVE_0

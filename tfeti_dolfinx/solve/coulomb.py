@@ -23,13 +23,7 @@ from tfeti_dolfinx.qp.friction_newton import (
     newton_on_law,
 )
 from tfeti_dolfinx.qp.newton import multipliers_at
-from tfeti_dolfinx.qp.problem import (
-    ConvergedReason,
-    Monitor,
-    Point,
-    QPResult,
-    Steps,
-)
+from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, Point, QPResult, Steps
 from tfeti_dolfinx.solve.solver import solve_dual
 
 

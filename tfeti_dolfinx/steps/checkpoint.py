@@ -271,12 +271,7 @@ class Checkpoint:
         return _hash((self.path / name).read_bytes()).hexdigest()
 
     def _load(
-        self,
-        kind: str,
-        number: int,
-        checksums: list[str],
-        subdomains: list[list[int]],
-        where: str,
+        self, kind: str, number: int, checksums: list[str], subdomains: list[list[int]], where: str
     ) -> Table:
         """Return what this rank's subdomains have; rows stand by labels.
 
