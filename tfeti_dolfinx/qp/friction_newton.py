@@ -282,7 +282,7 @@ def _solved_on_face(
 
     ``share`` of the residual is left.
     """
-    qp, comm = program.qp, program.qp.comm
+    qp, comm = program.qp, program.qp.coarse.comm
     oblique = program.oblique(on.face, on.C)
     M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
 
