@@ -41,7 +41,9 @@ def qp_of(F, d, G, e, bounded):
 
 
 def solved(qp, tolerance, start=None):
-    at = operator_product(qp.F, qp.comm, feasible_start(qp, start) if start else first_point(qp))
+    at = operator_product(
+        qp.F, qp.coarse.comm, feasible_start(qp, start) if start else first_point(qp)
+    )
     found = newton(qp, homogenise(qp, at), StoppingRule(tolerance), max_it=3000, start=start)
     assert found.reason > 0
     return found
@@ -128,7 +130,10 @@ def test_rows_that_exclude_each_other_are_named(room, solvable):
     qp = QP(matrix(F), d, DenseCoarse(np.zeros((0, 3)), np.zeros(0)), bounds_on(np.arange(3)))
     start = vector([1.0, 1.0, 0.0])  # both touch
     result = newton(
-        qp, homogenise(qp, operator_product(qp.F, qp.comm, start)), StoppingRule(1e-10), max_it=100
+        qp,
+        homogenise(qp, operator_product(qp.F, qp.coarse.comm, start)),
+        StoppingRule(1e-10),
+        max_it=100,
     )
     if not solvable:
         assert result.reason.name == "DIVERGED_CONTRADICTION"

@@ -25,7 +25,9 @@ from tfeti_dolfinx.qp.sets import Status
 
 
 def solved(qp, tolerance, monitor=no_monitor, start=None):
-    at = operator_product(qp.F, qp.comm, feasible_start(qp, start) if start else first_point(qp))
+    at = operator_product(
+        qp.F, qp.coarse.comm, feasible_start(qp, start) if start else first_point(qp)
+    )
     rule = StoppingRule(tolerance)
     return newton(qp, homogenise(qp, at), rule, max_it=2000, start=start, monitor=monitor)
 

@@ -51,11 +51,11 @@ def count(qp, num_steps):
     """Global calls of so many steps, with what comes before and after them."""
     start = homogenise(qp)
     point, steps = Point(start.lam_bar, start.gradient), Steps()
-    before = qp.comm.calls
+    before = qp.coarse.comm.calls
     reason = pcpg(qp, point, StoppingRule(0.0), steps, num_steps)
     assert reason == ConvergedReason.DIVERGED_ITS
     assert steps.cg == num_steps
-    return qp.comm.calls - before
+    return qp.coarse.comm.calls - before
 
 
 @pytest.mark.parametrize(("on_face", "preconditioned"), [(False, False), (True, True)])

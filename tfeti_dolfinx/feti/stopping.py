@@ -255,7 +255,8 @@ class Accuracy(StoppingRule):
         tolerance: Norm of the residuals from which on one looks (again).
         drifted: Whether the solver's gradient has to be made anew.
         norm: ‖F‖, or an estimate.
-        recovered: The displacement of the last look.
+        recovered: What the last look has recovered.
+        u: This rank's part of its displacement, shape ``(n,)``.
         looks: How many looks there were.
         measures: What the last look has seen.
         goal: An error beside which the algebraic one has to be small, too, or None.
@@ -263,6 +264,7 @@ class Accuracy(StoppingRule):
     """
 
     measures: Measures
+    u: Array
 
     def __init__(
         self,
@@ -336,7 +338,7 @@ class Accuracy(StoppingRule):
         )
         now = measure(self._dual, state, face, self.norm, before)
         self._before = self.measures if self.looks else None
-        self.recovered, self.measures = state, now
+        self.recovered, self.measures, self.u = state, now, state.u
         self.looks, self.waits = self.looks + 1, False
         if self.goal is not None:
             bound, goal = energy_bound(self._dual, lam, state.u, self.norm), self.goal(state.u)
@@ -430,12 +432,6 @@ class Accuracy(StoppingRule):
         now, allowed = self.measures, self.tolerances().energy
         size = max(now.energy, allowed, TINY)
         return now.error / size, allowed / size
-
-    @property
-    def u(self) -> Array:
-        """This rank's part of the displacement at the last look, shape ``(n,)``."""
-        assert self.recovered is not None, "nothing has been measured yet"
-        return self.recovered.u
 
     def _at_rest(self) -> Array:
         """The size of displacements that are rounding of 0, of bodies without a load, else 0."""

@@ -99,7 +99,7 @@ class FiniteJ2Plasticity(Plasticity):
         point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, hardening)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
             check_return(point.solved, hardening)
-        P, dP = point.stress(), point.tangent(self._entries)
+        P, dP = point.P, point.tangent(self._entries)
         P[out] = dP[out] = np.nan
         dilatation = np.log(np.linalg.det(F))
         if self._at.selective:  # that of the centre of the cell, nearly
@@ -154,6 +154,9 @@ class _Return:
         p: Accumulated plastic strains, shape (n,).
         mu: Shear moduli, shape (n,).
         hardening: The yield stress.
+
+    Attributes:
+        P: τ F⁻ᵀ, shape (n, 3, 3), without its volumetric part.
     """
 
     def __init__(
@@ -172,17 +175,14 @@ class _Return:
         self.share = 1.0 - 3.0 * mu * self.dp / q
         self.regular = hardening.regularisation * (self.dp > 0.0)
         self.n, self.q, self.s = 1.5 * s / q[:, None], q, s
-        self.tau = (self.axes * (self.share[:, None] * s)[:, None, :]) @ _transposed(self.axes)
-
-    def stress(self) -> Array:
-        """Return P = τ F⁻ᵀ, shape (n, 3, 3), without its volumetric part."""
-        return np.asarray(self.tau @ _transposed(self.F_inverse))
+        tau = (self.axes * (self.share[:, None] * s)[:, None, :]) @ _transposed(self.axes)
+        self.P = tau @ _transposed(self.F_inverse)
 
     def tangent(self, entries: list[tuple[int, int]]) -> Array:
         """Return ∂P/∂F for some entries of both, shape (n, m, m)."""
         rows, columns = np.array(entries).T
         diagonal, shear = self._moduli()
-        P, turned = self.stress(), _transposed(self.axes)
+        P, turned = self.P, _transposed(self.axes)
         found = np.empty((len(self.F), len(entries), len(entries)))
         for k, (i, j) in enumerate(entries):
             # δF = e_i e_jᵀ, so that δb has M's row j in its row i

@@ -112,7 +112,7 @@ class Directions:
     def __init__(self, qp: QP) -> None:
         self.r, self.p = np.zeros(len(qp.d)), np.zeros(len(qp.d))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
-        rows = int(largest(qp.comm, np.array([len(qp.d)])))
+        rows = int(largest(qp.coarse.comm, np.array([len(qp.d)])))
         most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if qp.keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
@@ -156,7 +156,7 @@ class Progress:
             return False
         work, load = qp.dot((point.lam, point.g), (point.lam, qp.d))
         gain, self.steps, self.gain = self.gain, 0, 0.0
-        return bcast_from_root(qp.comm, gain <= DEFAULT.rounding * (abs(work) + abs(load)))
+        return bcast_from_root(qp.coarse.comm, gain <= DEFAULT.rounding * (abs(work) + abs(load)))
 
 
 # --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
@@ -191,7 +191,7 @@ def pcpg(
     ``directions``, which are updated, are what an earlier call at this point with this ``qp`` has
     left.
     """
-    own, comm = Directions(qp) if directions is None else directions, qp.comm
+    own, comm = Directions(qp) if directions is None else directions, qp.coarse.comm
     recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
     least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
@@ -277,10 +277,10 @@ def solve_by_pcpg(
     ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
     """
     point, steps = Point(homogenised.lam_bar, homogenised.gradient), Steps()
-    monitor(steps, "start", point.lam, norm_over(qp.comm, homogenised.b), 0.0)
+    monitor(steps, "start", point.lam, norm_over(qp.coarse.comm, homogenised.b), 0.0)
     reason = pcpg(qp, point, rule, steps, max_it, monitor)
     g = qp.coarse.project(point.g)
-    norm = norm_over(qp.comm, g)
+    norm = norm_over(qp.coarse.comm, g)
     rounds = norm <= STRANGE * homogenised.rounding
     if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and rounds:
         reason = ConvergedReason.DIVERGED_ROUNDING
@@ -320,4 +320,4 @@ def _begun(qp: QP, point: Point, own: Directions) -> tuple[RecycledOnFace | None
             # rounding of many directions is none of Gλ = e
             point.lam, point.g = point.lam + project(way), point.g + past.known.images.T @ b
             own.fresh, own.r = True, project(project(-point.g))
-    return past, norm_over(qp.comm, own.r)
+    return past, norm_over(qp.coarse.comm, own.r)

@@ -96,15 +96,15 @@ def first_point(qp: QP) -> Array:
     multiplies by nothing.
     """
     zero = qp.feasible.project(np.zeros(len(qp.d)))
-    if not np.any(qp.coarse.e) and not any_rank(qp.comm, zero):
+    if not np.any(qp.coarse.e) and not any_rank(qp.coarse.comm, zero):
         return zero
     face = qp.feasible.face(zero, zero)
-    if not any_rank(qp.comm, face.status >= RUBS):
+    if not any_rank(qp.coarse.comm, face.status >= RUBS):
         coarse = qp.coarse.on_face(face)
         lam = coarse.particular()
         held = imbalance(coarse, lam) <= HELD
         # where 0 is inside of Ω, as with adhesion, rows of contact are free and may leave it
-        if held and not any_rank(qp.comm, qp.feasible.project(lam) != lam):
+        if held and not any_rank(qp.coarse.comm, qp.feasible.project(lam) != lam):
             return lam
     return _on_foundation(qp, project_onto_feasible(qp.coarse, qp.feasible, zero))
 
@@ -124,7 +124,7 @@ def _on_foundation(qp: QP, least: FeasiblePoint, max_it: int = 20, alike: float 
         lam = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count)).lam
         touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
         before = count
-        count = max(int(summed(qp.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
+        count = max(int(summed(qp.coarse.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
         if abs(count - before) <= alike * before:
             break
     return lam
@@ -251,9 +251,9 @@ class NewtonIteration:
             face = self.feasible.face(0.5 * (z.lam + moved), self.s)
         pressed = self.pressed.status
         early = (face.status == Status.STICK) & (pressed == Status.SLIP)
-        if any_rank(self.qp.comm, face.status >= RUBS):
+        if any_rank(self.qp.coarse.comm, face.status >= RUBS):
             early |= (face.status == Status.TOUCHING) & (pressed == Status.OPEN)
-        if not any_rank(self.qp.comm, early):
+        if not any_rank(self.qp.coarse.comm, early):
             return z, face
         self.resume = False
         return Point(self.back, z.g + self.qp.F(self.back - z.lam)), self.pressed
@@ -377,12 +377,12 @@ class FaceSolver:
         order, F + Z diag(κ) Zᵀ.
         """
         qp, before = self._qp, self._face
-        same = before is not None and not any_rank(qp.comm, face.status != before.status)
+        same = before is not None and not any_rank(qp.coarse.comm, face.status != before.status)
         if same and not self._curved:
             return True
         self._steps.faces += not same
         slips = ~face.held & (face.status == Status.SLIP)
-        self._face, self._curved = face, any_rank(qp.comm, slips)
+        self._face, self._curved = face, any_rank(qp.coarse.comm, slips)
         self.coarse = qp.coarse.on_face(face)
         self._on_face = replace(qp, coarse=self.coarse, held=face.held, preconditioner=None)
         if self._curved:
@@ -415,7 +415,7 @@ class FaceSolver:
         """Return whether rows that do not slip are outside of Ω."""
         assert self._face is not None
         apart = self._qp.feasible.project(z.lam) - z.lam
-        return any_rank(self._qp.comm, (apart != 0.0) & (self._face.status != Status.SLIP))
+        return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._face.status != Status.SLIP))
 
     def _along_null_space(self, z: Point) -> Point:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
@@ -426,16 +426,16 @@ class FaceSolver:
         own, qp, given = self.directions, self._qp, self._parameters
         assert self._face is not None
         for way in (own.p, own.r):
-            size, Fw = largest(qp.comm, way), qp.F(way)
+            size, Fw = largest(qp.coarse.comm, way), qp.F(way)
             curvature, square = qp.dot((way, Fw), (way, way))
             if size == 0.0 or own.seen(curvature, square):
                 continue
             way, Fw = self._unseen(way, Fw)
             # to the first bound, maybe infinite; rounding ends no way
-            small = given.rounding * largest(qp.comm, way)
+            small = given.rounding * largest(qp.coarse.comm, way)
             moves = (self._face.status != Status.SLIP) & (np.abs(way) > small)
             bound = qp.feasible.max_step(z.lam, -np.where(moves, way, 0.0))
-            length = least(qp.comm, max(bound, 0.0))
+            length = least(qp.coarse.comm, max(bound, 0.0))
             if np.isfinite(length):
                 step = given.beyond * length
                 return Point(z.lam + step * way, z.g + step * Fw)
@@ -445,7 +445,7 @@ class FaceSolver:
             FF, QQ, pp, pd, dd = qp.dot((Fp, Fp), (Qp, Qp), (p, p), (p, d), (d, d))
             unseen = max(FF / max(own.norm, TINY) ** 2, QQ) <= given.rounding**2 * pp
             if pp > 0.0 and unseen and pd > given.apart * np.sqrt(dd * pp):
-                most = largest(qp.comm, p)
+                most = largest(qp.coarse.comm, p)
                 self.excluding = np.flatnonzero(np.abs(p) > given.takes_part * most)
             break
         return z
@@ -470,12 +470,12 @@ class FaceSolver:
             self._on_face = replace(self._on_face, preconditioner=qp.preconditioner_on(face))
         own.fresh = own.fresh or not resume or self._curved
         share = given.stage if resume else given.reduction
-        target = share * min(norm_over(qp.comm, self.coarse.project(z.g)), optimality)
+        target = share * min(norm_over(qp.coarse.comm, self.coarse.project(z.g)), optimality)
         lowest = 0.0 if self._rule.waits else given.final * self._rule.tolerance
         rule = StoppingRule(max(target, lowest))
         end, norm = Point(z.lam, z.g), own.norm
         reason = pcpg(self._on_face, end, rule, self._steps, self._max_it, self._monitor, own)
-        self.left = norm_over(qp.comm, own.r)
+        self.left = norm_over(qp.coarse.comm, own.r)
         if self._curved:
             end.g = end.g - face.bend(end.lam - z.lam)
             own.norm = norm  # small circles bend far more than F does
@@ -519,7 +519,7 @@ def newton(
     >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise, operator_product
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
-    >>> start = homogenise(qp, operator_product(F, qp.comm, first_point(qp)))
+    >>> start = homogenise(qp, operator_product(F, qp.coarse.comm, first_point(qp)))
     >>> result = newton(qp, start, StoppingRule(1e-10))
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
@@ -532,8 +532,8 @@ def newton(
     if mu is None:
         mu = multipliers_at(qp, z)
     state = NewtonIteration(qp, solver, parameters, z, mu)
-    monitor(steps, "start", homogenised.lam_bar, norm_over(qp.comm, homogenised.b), 0.0)
-    friction = any_rank(qp.comm, state.pressed.status >= RUBS)
+    monitor(steps, "start", homogenised.lam_bar, norm_over(qp.coarse.comm, homogenised.b), 0.0)
+    friction = any_rank(qp.coarse.comm, state.pressed.status >= RUBS)
     reason = ConvergedReason.ITERATING
     if friction and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before

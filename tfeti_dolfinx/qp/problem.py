@@ -83,11 +83,6 @@ class QP:
     keeps: bool = True
     foundation: Callable[[int], Array] | None = None
 
-    @property
-    def comm(self) -> MPI.Intracomm:
-        """Communicator."""
-        return self.coarse.comm
-
     def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
         """Return xᵀy of pairs of vectors, rank 0's on every rank. Collective."""
         return dot_over(self.coarse.comm, *pairs)
@@ -230,7 +225,7 @@ class LastProduct:
         So what steps leave out of the gradient does not grow from solve to solve.
         """
         (x, g), self.x, self.within = self.looked, result.lam, 0.0
-        other = any_rank(qp.comm, not np.array_equal(x, self.x))
+        other = any_rank(qp.coarse.comm, not np.array_equal(x, self.x))
         self.Fx = (result.gradient + qp.coarse.combined(result.mu) if other else g) + qp.d
         self.d, self.e = qp.d, np.array(qp.coarse.e)
 
@@ -288,8 +283,8 @@ def homogenise(
         warm: Without it: λ̄ may be the solution. ‖P d‖ and ‖P F λ‖ are equal there, and b₀ is ‖P d‖
             where e = 0: the larger one is taken.
     """
-    project, norm = qp.coarse.project, partial(norm_over, qp.comm)
-    at = at or operator_product(qp.F, qp.comm, qp.coarse.particular())
+    project, norm = qp.coarse.project, partial(norm_over, qp.coarse.comm)
+    at = at or operator_product(qp.F, qp.coarse.comm, qp.coarse.particular())
     # 1. b; d on rows that are open without forces: P would spread it over all others
     gradient = at.Fx - qp.d
     phi, beta = qp.feasible.split(qp.feasible.project(np.zeros(len(qp.d))), -qp.d)

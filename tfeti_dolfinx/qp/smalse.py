@@ -86,7 +86,7 @@ class InnerTest:
     ) -> None:
         self._qp, self._homogenised, self._rule = qp, homogenised, rule
         self._parameters = parameters
-        self._eta = parameters.eta * norm_over(qp.comm, homogenised.b)
+        self._eta = parameters.eta * norm_over(qp.coarse.comm, homogenised.b)
         self.M, self.reason, self.idle = parameters.M * qp.norm, ConvergedReason.ITERATING, 0
         self._lagrangian, self._equality = -float("inf"), float("inf")
 
@@ -173,8 +173,8 @@ def smalse(
         y = coarse.combined(start.mu)
     lam = qp.feasible.project(lam_bar if start is None else start.lam)
     x = lam - lam_bar
-    g = operator_product(A, qp.comm, x).Fx - b + y
-    state = MprgpIterate(A, lam, g, qp.feasible, qp.comm)
+    g = operator_product(A, qp.coarse.comm, x).Fx - b + y
+    state = MprgpIterate(A, lam, g, qp.feasible, qp.coarse.comm)
     inner = MprgpParameters(parameters.alpha_bar / (max(norm, rho) or 1.0), parameters.gamma)
     reason = ConvergedReason.ITERATING
     while reason == ConvergedReason.ITERATING:
@@ -183,7 +183,7 @@ def smalse(
         # Step 2: test
         x = state.x - lam_bar
         Qx = coarse.Q(x)
-        equality = norm_over(qp.comm, Qx)
+        equality = norm_over(qp.coarse.comm, Qx)
         monitor(steps, "outer", state.x, state.projected_gradient, equality)
         indefinite = broken == ConvergedReason.DIVERGED_INDEFINITE_MAT  # or rounding
         if indefinite and test.examine(state, equality) <= STRANGE * homogenised.rounding:

@@ -355,7 +355,7 @@ class NewtonOnLaw:
         )
         program = LawProgram(qp, law, dual.coarse.oblique, norm)
         # Step 1: the start, with its μ or that of least squares: the lesser residual
-        Fx = dual.last.image(qp.F, qp.comm, start[0]).Fx
+        Fx = dual.last.image(qp.F, qp.coarse.comm, start[0]).Fx
         z = Point(start[0], Fx - qp.d)
         known = start[1] if len(start[1]) == qp.coarse.dimension else multipliers_at(qp, z)
         points = [
@@ -366,7 +366,7 @@ class NewtonOnLaw:
         residual = min(residuals)
         first = points[residuals.index(residual)]
         # Step 2: the target
-        size = norm_over(qp.comm, qp.coarse.project(qp.d))
+        size = norm_over(qp.coarse.comm, qp.coarse.project(qp.d))
         target = min(self._share * self._rtol * size, parameters.finer * residual, aim)
         # Step 3: Newton's method, or the path of growing friction where bodies are held
         end, steps = None, 0

@@ -118,7 +118,7 @@ def solve_dual(
     begin = _start(start, qp)
     homogenised = _homogenise(dual, qp, solver, begin)
     if monitor is None and options.monitor:
-        monitor = PrintMonitor(qp.comm, qp.feasible, lambda: dual.F.count["solver"])
+        monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count["solver"])
     rtol = options.number if rtol is None else rtol
     scale = homogenised.reference, homogenised.rounding
     rule = Accuracy(dual, rtol, options.atol, scale, qp.norm)
@@ -149,7 +149,7 @@ def solve_dual(
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
     """Return the solver's start, none from 0; μ is None if the given one is of another kernel."""
-    if values is None or not any_rank(qp.comm, values[0]):
+    if values is None or not any_rank(qp.coarse.comm, values[0]):
         return None
     lam, mu = values
     return Start(lam, np.array(mu) if len(mu) == qp.coarse.dimension else None)
@@ -158,19 +158,19 @@ def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
 def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:
     """Homogenise with λ̄ at the solver's start, or λ̄₀, whose image is kept."""
     if start is not None and solver.warm is not None:
-        at = dual.last.image(qp.F, qp.comm, solver.warm(qp, start))
+        at = dual.last.image(qp.F, qp.coarse.comm, solver.warm(qp, start))
         # Begin at 0 where it is admissible and q is no less at a start, as after unloading: of what
         # the start has and the solution has not, conjugate gradients would leave its rounding.
         zero = np.zeros(len(qp.d))
         may = not np.any(qp.coarse.e) and not np.any(qp.feasible.project(zero))
         energy, work = qp.dot((at.x, at.Fx), (at.x, qp.d))
-        if not any_rank(qp.comm, not may) and 0.5 * energy >= work:
+        if not any_rank(qp.coarse.comm, not may) and 0.5 * energy >= work:
             at = OperatorProduct(zero, zero)
             if start.mu is not None:
                 start.mu[:] = 0.0
         return homogenise(qp, at, dual.known_image(), warm=True)
     if solver.cold is not None:
-        return homogenise(qp, operator_product(qp.F, qp.comm, solver.cold(qp)))
+        return homogenise(qp, operator_product(qp.F, qp.coarse.comm, solver.cold(qp)))
     return homogenise(qp, dual.natural_image())
 
 
