@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
@@ -144,17 +144,20 @@ def _one_step(target: Path, solution: Solution, interior: bool) -> list[Path]:
         raise
 
 
-class PvdFile:
-    """A PVD file with its parts, in a folder until they are whole, as ``VtxFile``.
+class SeriesFile:
+    """A VTX file, or a PVD file with its parts in a folder, of another name until it is whole.
 
-    Creation and methods are collective.
+    Creation and methods are collective. ADIOS2 throws where a disk is full, throws again in its
+    destructor, which ends the process, and lets other ranks wait for the one that has failed. So
+    what is to be written is reserved before.
 
     Args:
         name: Its name once it is whole.
-        functions: What it has: on the nodes of one element, and one value a cell.
+        functions: What it has, all of one mesh; of a PVD file on the nodes of one element, and one
+            value a cell.
 
     Attributes:
-        partial: The folder until then.
+        partial: Its name until then, or the folder.
 
     Raises:
         InputError: It cannot be written, as all methods say, too.
@@ -162,24 +165,40 @@ class PvdFile:
 
     def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
         self._name, self._comm = name, functions[0].function_space.mesh.comm
-        self._functions = list(functions)
-        self._bytes = 3 * _bytes_of(functions)  # numbers are texts
-        self.partial = begin_file(name, self._comm, is_folder=True)
+        self._functions, self._count, self._has_parts = list(functions), 0, name.suffix == ".pvd"
+        self._bytes = _bytes_of(functions) * (3 if self._has_parts else 1)  # numbers are texts
+        self.partial = begin_file(name, self._comm, self._has_parts)
+        self._writer: Any = None
+        if not self._has_parts:
+            _reserve(name, self._comm, LITTLE)
         with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
-            self._vtk: Any = io.VTKFile(self._comm, self.partial / name.name, "w")
+            if self._has_parts:
+                self._writer = io.VTKFile(self._comm, self.partial / name.name, "w")
+            else:
+                self._writer = io.VTXWriter(self._comm, self.partial, self._functions, engine="BP4")
 
     def write(self, time: float) -> None:
         """Add what the functions and the mesh have; times before this one are whole."""
-        _reserve(self._name, self._comm, self._bytes)
-        with _written_by(self._vtk, self._name, self._comm):
-            self._vtk.write_function(self._functions, time)
+        before = 0 if self._has_parts else self._count * self._bytes
+        _reserve(self._name, self._comm, self._bytes, before)
+        given = (self._functions, time) if self._has_parts else (time,)
+        writer, self._writer = self._writer, None  # where it fails it is never used again
+        with _written_by(writer, self._name, self._comm):
+            (writer.write_function if self._has_parts else writer.write)(*given)
+        self._writer, self._count = writer, self._count + 1
 
     def close(self) -> None:
-        """Write what is left: the destructor does it, and makes folders that are not there."""
-        self._vtk = None
+        """Write what is left; of VTK the destructor does it, and makes folders that are missing."""
+        writer, self._writer = self._writer, None
+        if writer is not None and not self._has_parts:
+            with _written_by(writer, self._name, self._comm):
+                writer.close()
 
     def appear(self) -> list[Path]:
         """Give the files their names, in the place of those of an earlier run."""
+        if not self._has_parts:
+            end_file(self.partial, self._name, self._comm)
+            return [self._name]
         self._comm.barrier()
         own = re.compile(re.escape(self._name.stem) + r"(_p\d+_)?\d{6}\.p?vtu")
         names: list[str] = []
@@ -194,59 +213,6 @@ class PvdFile:
                     os.replace(self.partial / part, self._name.with_name(part))
         _drop(self.partial, self._comm)
         return [self._name.with_name(part) for part in self._comm.bcast(names, root=0)]
-
-
-class VtxFile:
-    """A VTX file that has another name until it is whole. Creation and methods are collective.
-
-    ADIOS2 throws where a disk is full, throws again in its destructor, which ends the process, and
-    lets other ranks wait for the one that has failed. So what is to be written is reserved before.
-
-    Args:
-        name: Its name once it is whole.
-        functions: What it has, all of one mesh.
-
-    Attributes:
-        partial: Its name until then.
-
-    Raises:
-        InputError: It cannot be written, as all methods say, too.
-    """
-
-    def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
-        self._name, self._comm = name, functions[0].function_space.mesh.comm
-        self._bytes, self._count, self._open = _bytes_of(functions), 0, False
-        self.partial = begin_file(name, self._comm)
-        _reserve(name, self._comm, LITTLE)
-        with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
-            self._vtx = io.VTXWriter(self._comm, self.partial, list(functions), engine="BP4")
-        self._open = True
-
-    def write(self, time: float) -> None:
-        """Add what the functions and the mesh have; times before this one are whole."""
-        _reserve(self._name, self._comm, self._bytes, self._count * self._bytes)
-        self._of_library(lambda: self._vtx.write(time))
-        self._count += 1
-
-    def close(self) -> None:
-        """Write what is left."""
-        if self._open:
-            self._of_library(self._vtx.close)
-        self._open = False
-
-    def appear(self) -> list[Path]:
-        """Give the file its name, in the place of what has it."""
-        end_file(self.partial, self._name, self._comm)
-        return [self._name]
-
-    def _of_library(self, do: Callable[[], None]) -> None:
-        """Write, and never again where that fails."""
-        try:
-            with _written_by(self._vtx, self._name, self._comm):
-                do()
-        except TfetiError:
-            self._open = False
-            raise
 
 
 class Series:
@@ -271,15 +237,15 @@ class Series:
         )
         self._functions = nodal + cellwise
         self._count, self._ended = 0, False
-        self._files: list[VtxFile | PvdFile] = []
+        self._files: list[SeriesFile] = []
         of_cells = cell_fields(solution) + cellwise
         try:
             if target.suffix == ".pvd":
-                self._files.append(PvdFile(target, nodal + of_cells))
+                self._files.append(SeriesFile(target, nodal + of_cells))
             else:
-                self._files.append(VtxFile(target, nodal))
+                self._files.append(SeriesFile(target, nodal))
                 beside = target.with_name(f"{target.stem}_cells.bp")
-                self._files.append(VtxFile(beside, of_cells))
+                self._files.append(SeriesFile(beside, of_cells))
             self._growing = self._files if cellwise else self._files[:1]
             if len(self._growing) < len(self._files):
                 self._files[1].write(0.0)
