@@ -1,6 +1,8 @@
 """Solves that repeat: only what depends on a change is made again."""
 
 import gc
+import sys
+from collections import Counter
 from weakref import ref
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from scenes import clamp, curved_obstacle, decomposed, hooke, strain
+from scipy.sparse._base import _spbase
 
 import tfeti_dolfinx as tfeti
 
@@ -18,8 +21,8 @@ MADE_ONCE = {"stiffness", "search", "rows", "factors", "trace", "coarse problem"
 class Repeated:
     """A box on a curved obstacle, clamped on the left, that takes other data."""
 
-    def __init__(self, cell="hexahedron", contact=True, **options):
-        d = decomposed(cell, 4, 6)
+    def __init__(self, cell="hexahedron", contact=True, parts=6, **options):
+        d = decomposed(cell, 4, parts)
         gdim = d.mesh.geometry.dim
         V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
         u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -105,6 +108,41 @@ def test_another_load_makes_no_row_and_no_factor(scene):
     assert distance(second, scene.fresh(load=-0.08)) <= 1e-8
     assert distance(second, first) > 1e-2
     assert np.array_equal(first.displacement.x.array, before)
+
+
+def counted(solve):
+    """Python calls and sparse matrices of a solve."""
+    calls, matrices, make = Counter(), Counter(), _spbase.__init__
+
+    def init(self, *given, **words):
+        matrices["made"] += 1
+        make(self, *given, **words)
+
+    def profile(frame, event, given):
+        calls[event] += 1
+
+    try:
+        _spbase.__init__ = init
+        sys.setprofile(profile)
+        solve()
+    finally:
+        sys.setprofile(None)
+        _spbase.__init__ = make
+    return calls["call"], matrices["made"]
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_small_problems_take_few_calls_and_sparse_matrices(cell):
+    """A first solve makes 100 matrices at most, another load few, by 5000 calls of functions."""
+    scene = Repeated(cell, parts=8, qp_type="newton")
+    most = 5000 if scene.problem.decomposition.comm.size == 1 else 7500  # ranks exchange
+    assert counted(scene.solve)[1] <= 100
+    calls, matrices = counted(lambda: scene.solve(load=-0.051))
+    assert calls <= most
+    assert matrices <= 5
+    scene.solve()
+    assert counted(scene.solve)[0] <= most // 2
+    scene.problem.destroy()
 
 
 def test_other_data_make_what_depends_on_them_alone(scene):

@@ -223,7 +223,7 @@ class ContactProblem:
             raise
         self._compose_report()
         self._log_warnings()
-        self._system.search.warn_of_unmet()
+        self._system.search.warn_of(self.report.unmet_contacts)
         if self.options.view and self.decomposition.comm.rank == 0:
             options = self.options.view_text(self._settings.prefix)
             print(options, self.report.details(), sep="\n", flush=True)

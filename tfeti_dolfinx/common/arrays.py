@@ -120,7 +120,7 @@ class LocalMatrix:
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
         if x.ndim > 1:
-            return _of_columns(self._petsc.matMult, x)
+            return of_columns(self._petsc.matMult, x)
         self._x.setArray(x)
         self._petsc.mult(self._x, self._y)
         return np.array(self._y.array_r)
@@ -128,7 +128,7 @@ class LocalMatrix:
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""
         if y.ndim > 1:
-            return _of_columns(self._petsc.transposeMatMult, y)
+            return of_columns(self._petsc.transposeMatMult, y)
         self._y.setArray(y)
         self._petsc.multTranspose(self._y, self._x)
         return np.array(self._x.array_r)
@@ -139,7 +139,7 @@ class LocalMatrix:
         return Entries(data, indices, indptr, self.shape)
 
 
-def _of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array) -> Array:
+def of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array) -> Array:
     """Return a product of PETSc with columns."""
     given = PETSc.Mat().createDense(x.shape, array=np.asfortranarray(x), comm=PETSc.COMM_SELF)
     made = product(given)

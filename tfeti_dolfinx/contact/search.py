@@ -41,7 +41,7 @@ class ContactSearch:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
         length: Length of the scene.
         records: All conditions of this rank; those ``within_reach`` get rows.
-        said: Contacts that ``warn_of_unmet`` has named last.
+        said: Contacts that ``warn_of`` has named last.
 
     Raises:
         InputError: A pair is there twice, or a contact raises it.
@@ -178,9 +178,9 @@ class ContactSearch:
         """Contacts as reports name them: position in the list, and name."""
         return [f"{i}: {self.contacts[i].name}" for i in positions]
 
-    def warn_of_unmet(self) -> None:
+    def warn_of(self, unmet: list[str]) -> None:
         """Log on rank 0 which contacts have met nobody, once."""
-        before, self.said = self.said, self.unmet()
+        before, self.said = self.said, unmet
         for contact in self.said:
             if self._dofs.comm.rank == 0 and contact not in before:
                 log.warning("contact %s has met nobody, and has no rows", contact)

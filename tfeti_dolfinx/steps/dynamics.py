@@ -61,7 +61,8 @@ def balance(
     """
     inertia, motion = forms.inertia, forms.inertia.motion
     M = inertia.M
-    u, v = solution.displacement.x.array, solution.velocity.x.array
+    u, v = solution.dofs.to_dolfinx(solution.u), solution.v
+    assert v is not None
     start, way = motion.start, u - motion.u
     kicked = motion.towards - motion.u - motion.size * start
     sets, primal = dual.constraints.sets, solution.dofs.to_primal(way)

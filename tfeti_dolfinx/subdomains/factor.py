@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.common.arrays import Array, as_petsc_matrix
+from tfeti_dolfinx.common.arrays import Array, as_petsc_matrix, of_columns
 from tfeti_dolfinx.common.compat import is_read
 from tfeti_dolfinx.errors import FactorError
 
@@ -87,23 +87,18 @@ class CholeskyFactor:
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
+        if b.size == 0:
+            return np.array(b)
         if b.ndim == 2:
-            if b.shape[1] == 1:  # a subclass may have a solve of its own
-                return CholeskyFactor.solve(self, b[:, 0])[:, None]
-            if b.size == 0:
-                return np.array(b)
-            x = np.empty(b.shape, order="F")
-            comm = PETSc.COMM_SELF
-            given = PETSc.Mat().createDense(b.shape, array=np.asfortranarray(b), comm=comm)
-            found = PETSc.Mat().createDense(b.shape, array=x, comm=comm)
-            self._factor.matSolve(given, found)
-            x = np.array(found.getDenseArray(readonly=True), order="F")
-            given.destroy()
-            found.destroy()
-            return x
+            return of_columns(self._solved, b)
         self._b.array[:] = b
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
+
+    def _solved(self, given: PETSc.Mat) -> PETSc.Mat:
+        found = given.duplicate()
+        self._factor.matSolve(given, found)
+        return found
 
 
 @contextmanager
