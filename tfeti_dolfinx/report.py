@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import sum_rows
 from tfeti_dolfinx.common.files import written_whole
 from tfeti_dolfinx.common.parallel import largest, summed
 from tfeti_dolfinx.common.validation import named
@@ -435,12 +435,18 @@ def _residuals(
     area = solution.area[rows.condition]
     tension = np.divide(missing, area, out=np.zeros(len(area)), where=area > 0.0)
     closed = solution.status_of_conditions != ContactStatus.OPEN
+    # how far copies of a node are apart, and from prescribed values
+    dofs, prescribed = solution.dofs, solution.gluing.prescribed
+    u = solution.u.reshape(-1, dofs.bs)
+    low, high = dofs.reduce(u, np.minimum), dofs.reduce(u, np.maximum)
+    at, value = prescribed.flag, prescribed.value
+    jumps = np.where(at, np.maximum(high, value), high) - np.where(at, np.minimum(low, value), low)
     return {
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
         "displacement_error": accuracy.relative_error(),
         "energy_error": accuracy.energy_error()[0],
-        "gluing_jump": largest(comm, _jumps(solution)),
+        "gluing_jump": largest(comm, jumps),
         "penetration": largest(comm, np.minimum(gap, 0.0)),
         "tension": largest(comm, np.maximum(tension, 0.0)),
         "complementarity": largest(comm, (solution.force * gap)[closed]),
@@ -459,13 +465,3 @@ def _tolerances(solution: Solution, accuracy: Accuracy) -> dict[str, float]:
         "complementarity": largest(comm, np.maximum(solution.force, 0.0)) * allowed.jump,
         "balance": allowed.balance,
     }
-
-
-def _jumps(solution: Solution) -> Array:
-    """For each owned group how far its copies are apart, and from prescribed values. Collective."""
-    dofs, prescribed = solution.dofs, solution.gluing.prescribed
-    u = solution.u.reshape(-1, dofs.bs)
-    low, high = dofs.reduce(u, np.minimum), dofs.reduce(u, np.maximum)
-    held_low = np.where(prescribed.flag, np.minimum(low, prescribed.value), low)
-    held_high = np.where(prescribed.flag, np.maximum(high, prescribed.value), high)
-    return held_high - held_low

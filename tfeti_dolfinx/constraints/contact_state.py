@@ -260,7 +260,13 @@ class ContactState:
         member = np.zeros(self.dofs.num_nodes, dtype=bool)
         member[surface_nodes(self.dofs, facets)] = True
         groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or))
-        force = self.support_forces[groups]
+        # −Bᵀλ, summed over the copies of a node, less the contact forces: gluing forces cancel
+        constraints = self.gluing.constraints
+        own = constraints.trace < len(self.u)  # those behind are of rigid bodies
+        forces = np.zeros_like(self.u)
+        forces[constraints.trace[own]] = -constraints.forces(self.lam)[own]
+        total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add)
+        force = (total - self.nodal_forces)[groups]
         return resultant(self.dofs.comm, self.places()[groups], force)
 
     @cached_property
@@ -368,17 +374,3 @@ class ContactState:
         records = self.gluing.records
         shares = records.weight[:, None] * self.condition_forces[records.condition]
         return self.dofs.reduce_on_owners(records.entry_group, shares)
-
-    @cached_property
-    def support_forces(self) -> Array:
-        """Forces of Dirichlet conditions on the owned groups. Collective at first use.
-
-        −Bᵀλ, summed over the copies of a node, less the contact forces: gluing forces cancel.
-        Shape ``(g, gdim)``.
-        """
-        constraints = self.gluing.constraints
-        own = constraints.trace < len(self.u)  # those behind are of rigid bodies
-        forces = np.zeros_like(self.u)
-        forces[constraints.trace[own]] = -constraints.forces(self.lam)[own]
-        total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add)
-        return total - self.nodal_forces

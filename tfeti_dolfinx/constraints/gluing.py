@@ -61,15 +61,19 @@ def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, He
     neighbours instead would have a Gram matrix of condition O(k²).
     """
     multiplicities = np.unique(dofs.multiplicity)
-    tables = [_glue(dofs, flag, weights, int(k)) for k in multiplicities if k > 1]
-    holding, component = _hold(dofs, flag, weights)
+    tables = [_glue(dofs, flag, weights, int(m)) for m in multiplicities if m > 1]
+    # one row with one entry per copy and prescribed component
+    of_copy = np.repeat(np.arange(dofs.num_groups), dofs.multiplicity)
+    copy, k = np.nonzero(flag[of_copy])
+    group, column = of_copy[copy], dofs.copies[copy] * dofs.bs + k
+    holding = Rows(group, np.arange(len(copy)), column, np.sqrt(weights[copy, k]))
     rows = stack([holding, *tables])
     order = np.argsort(rows.group, kind="stable")
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     rows = Rows(rows.group[order], place[rows.row], rows.column, rows.value)
     n = len(holding)  # these rows have one entry each, and their entries come first
-    return rows, HeldRows(rows.row[:n], component, rows.value[:n])
+    return rows, HeldRows(rows.row[:n], group * dofs.bs + k, rows.value[:n])
 
 
 def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
@@ -101,19 +105,6 @@ def _orthonormal(weights: Array) -> Array:
     rows[:, j, j + 1] = -sums[:, :-1]
     norms = sums[:, :-1] + sums[:, :-1] ** 2 / weights[:, 1:]
     return rows / np.sqrt(norms)[:, :, None]
-
-
-def _hold(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, Array]:
-    """One row with one entry per copy and prescribed component, and the components."""
-    group = np.repeat(np.arange(dofs.num_groups), dofs.multiplicity)
-    copy, component = np.nonzero(flag[group])
-    rows = Rows(
-        group=group[copy],
-        row=np.arange(len(copy)),
-        column=dofs.copies[copy] * dofs.bs + component,
-        value=np.sqrt(weights[copy, component]),
-    )
-    return rows, group[copy] * dofs.bs + component
 
 
 # --- Dirichlet values on torn copies ----------------------------------------------------------

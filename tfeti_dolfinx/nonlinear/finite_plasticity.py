@@ -94,7 +94,10 @@ class FiniteJ2Plasticity(Plasticity):
         F += np.eye(3)
         out = ~(np.linalg.det(F) > 0.0)
         F[out] = np.eye(3)
-        inverse_plastic = _symmetric(self.inverse_plastic.x.array.reshape(-1, 6))
+        components = self.inverse_plastic.x.array.reshape(-1, 6)
+        inverse_plastic = np.empty_like(F)
+        for k, (i, j) in enumerate(SYMMETRIC):
+            inverse_plastic[:, i, j] = inverse_plastic[:, j, i] = components[:, k]
         hardening = self.hardening()
         point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, hardening)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
@@ -243,11 +246,3 @@ class _Return:
 
 def _transposed(t: Array) -> Array:
     return np.swapaxes(t, 1, 2)
-
-
-def _symmetric(components: Array) -> Array:
-    """Return symmetric tensors, shape (n, 3, 3), from their components."""
-    t = np.empty((len(components), 3, 3))
-    for k, (i, j) in enumerate(SYMMETRIC):
-        t[:, i, j] = t[:, j, i] = components[:, k]
-    return t
