@@ -19,12 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block, SubdomainData
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.sparse_block import (
-    EQUAL,
-    SparseBlock,
-    Stiffness,
-    places_in_order,
-)
+from tfeti_dolfinx.subdomains.sparse_block import EQUAL, SparseBlock, Stiffness, places_in_order
 from tfeti_dolfinx.subdomains.subdomains import MakeBlock, subdomain_stiffness
 
 # --- Block of a subdomain with boundary elements ----------------------------------------------

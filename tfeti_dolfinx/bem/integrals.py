@@ -179,10 +179,7 @@ def _edge(xi: Array, a: Array, b: Array, c: Array) -> list[Map]:
 
 def _vertex(xi: Array, a: Array, b: Array, c: Array) -> list[Map]:
     j = xi**3 * b
-    return [
-        ((xi, xi * a), (xi * b, xi * b * c), j),
-        ((xi * b, xi * b * c), (xi, xi * a), j),
-    ]
+    return [((xi, xi * a), (xi * b, xi * b * c), j), ((xi * b, xi * b * c), (xi, xi * a), j)]
 
 
 # --- Layer integrals on segments --------------------------------------------------------------

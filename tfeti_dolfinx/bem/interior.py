@@ -30,11 +30,7 @@ class Interior:
     """
 
     def __init__(
-        self,
-        boundary: BoundarySolution | None,
-        u: fem.Function,
-        sigma: Any,
-        dofs: TornDofs,
+        self, boundary: BoundarySolution | None, u: fem.Function, sigma: Any, dofs: TornDofs
     ) -> None:
         self._boundary, self._u, self._sigma = boundary, u, sigma
         self._dofs = dofs

@@ -11,12 +11,7 @@ from scipy.sparse import csr_array, hstack
 from tfeti_dolfinx.common.arrays import Array, rows_times
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.feti.projectors import (
-    FaceFactors,
-    Grams,
-    ObliqueProjectors,
-    SemidefiniteFactor,
-)
+from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, ObliqueProjectors, SemidefiniteFactor
 from tfeti_dolfinx.feti.rigid_bodies import (
     TOLERANCES,
     Bodies,

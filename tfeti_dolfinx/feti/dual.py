@@ -36,14 +36,7 @@ from tfeti_dolfinx.qp.problem import (
     operator_product,
 )
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.sets import (
-    Bounds,
-    Ellipses,
-    Face,
-    FeasibleSet,
-    Product,
-    Status,
-)
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, FeasibleSet, Product, Status
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 

@@ -9,10 +9,7 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, dot_over, largest, summed
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.recovery import (
-    elastic_displacement,
-    min_norm_correction,
-)
+from tfeti_dolfinx.feti.recovery import elastic_displacement, min_norm_correction
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import FeasibleSet

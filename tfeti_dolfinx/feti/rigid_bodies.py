@@ -9,11 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import qr
-from scipy.sparse import (
-    csc_array,
-    csr_array,
-    hstack,
-)
+from scipy.sparse import csc_array, csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import Array, Entries, entries_at, entries_of_rows, entries_within

@@ -13,10 +13,7 @@ from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, as_petsc_matrix
 from tfeti_dolfinx.subdomains.block import Counters, candidate_modes
-from tfeti_dolfinx.subdomains.factor import (
-    CholeskyFactor,
-    NotPositiveDefiniteError,
-)
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
 # --- K⁺ -----------------------------------------------------------------------------------------
 

@@ -13,13 +13,7 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import (
-    TINY,
-    Array,
-    LocalMatrix,
-    entries_of_rows,
-    entries_within,
-)
+from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix, entries_of_rows, entries_within
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import (

@@ -23,13 +23,7 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.block import (
-    Block,
-    Counters,
-    OperatorKind,
-    RigidBlock,
-    SubdomainData,
-)
+from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind, RigidBlock, SubdomainData
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import (
@@ -402,11 +396,7 @@ class SubdomainMethod(Protocol):
 
 
 def subdomain_data(
-    dofs: TornDofs,
-    decomposition: Decomposition,
-    K: Any,
-    f: Array,
-    trace: Array,
+    dofs: TornDofs, decomposition: Decomposition, K: Any, f: Array, trace: Array
 ) -> Iterator[SubdomainData]:
     """Return the data of each subdomain's Block on this rank, made one at a time. Collective.
 
