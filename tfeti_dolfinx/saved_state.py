@@ -264,17 +264,6 @@ class SavedState:
             found[f.name] = (values, labels if known else None)
         return found
 
-    def of_other_ranks(self) -> SavedState:
-        """Return what counts where subdomains lie on other ranks: F may be another there.
-
-        Its value does not depend on K⁺ only up to Gᵀ.
-        """
-        nothing = np.zeros(0)
-        directions = np.zeros((2, len(self.lam), 0))
-        return replace(
-            self, mu=nothing, image=nothing, predicted_image=nothing, directions=directions
-        )
-
     def on_nodes(self, dofs: TornDofs) -> SavedState:
         """Return the state with nodes and cells in the order of this rank. Not collective.
 

@@ -192,9 +192,12 @@ def untorn_mesh(
         x=np.ascontiguousarray(all_x[first, :gdim]),
         names=physical_names(contents, top, comm),
     )
-    extent = _checked_extent(all_x, gdim, comm)
+    low, high = box_over_ranks(comm, all_x)
+    sides = high - low
+    if gdim == 2 and sides[2] > 1e-12 * sides.max():  # more than rounding
+        raise InputError("plane cells that do not lie in a plane z = constant: shells are not")
     if shared:
-        check_shared(mesh, all_ids, all_x, extent, comm)
+        check_shared(mesh, all_ids, all_x, float(sides.max()), comm)
     partitioned = comm.allreduce(bool(np.all(found.partitions >= 0)), op=MPI.LAND)
     return mesh, found.partitions if partitioned else None
 
@@ -221,15 +224,6 @@ def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -
             "tetrahedra or hexahedra of first or (complete) second order"
         )
     return kind, name
-
-
-def _checked_extent(x: Array, gdim: int, comm: MPI.Intracomm) -> float:
-    """Longest side of the box of all points; raises if plane cells do not lie in a plane."""
-    low, high = box_over_ranks(comm, x)
-    sides = high - low
-    if gdim == 2 and sides[2] > 1e-12 * sides.max():  # more than rounding
-        raise InputError("plane cells that do not lie in a plane z = constant: shells are not")
-    return float(sides.max())
 
 
 def _facet_tags(

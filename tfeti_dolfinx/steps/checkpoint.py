@@ -237,8 +237,11 @@ class Checkpoint:
         state = SavedState.from_table(table)
         own = index.subdomains[self._comm.rank] if self._comm.rank < len(index.states) else []
         same = self._comm.size == len(index.states) and own == self._subdomains
-        moved = any_rank(self._comm, not same)
-        return state.of_other_ranks() if moved else state
+        if not any_rank(self._comm, not same):
+            return state
+        # F may be another there: it depends on K⁺, but for its values up to Gᵀ
+        none, directions = np.zeros(0), np.zeros((2, len(state.lam), 0))
+        return replace(state, mu=none, image=none, predicted_image=none, directions=directions)
 
     def read_fields(self, kept: Kept, number: int) -> Table:
         """Return the fields of a step, of those that ``read`` found, on this rank.
