@@ -463,7 +463,7 @@ class System:
             self.tools if self.tools.num_unknowns else None,
             self._equals,
         )
-        self._K = None
+        self._K, self._subdomains.tangents = None, self.follows
         self._subdomains.retrace(trace)
         self.inverses += 1
 

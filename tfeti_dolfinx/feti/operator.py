@@ -169,12 +169,18 @@ def dirichlet_preconditioner(
 ) -> DualOperator:
     """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; with a metric if sparse. Collective.
 
-    From (λ + 2μ)/μ of ``volume`` on what is inside has to follow a trace.
+    From (λ + 2μ)/μ of ``volume`` on what is inside has to follow a trace, and in space in tangents,
+    some of whose cells yield and keep their volumes.
     """
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     metric, comm = None, subdomains.comm
     if not any_rank(comm, len(sparse) < len(subdomains.elastic)):
-        stiff = [block.bs for block in sparse if block.stiffness.stretch_over_shear > volume]
+        stiff = [
+            block.bs
+            for block in sparse
+            if (subdomains.tangents and block.bs == 3)
+            or block.stiffness.stretch_over_shear > volume
+        ]
         rigid = sum(len(block.trace_dofs) for block in subdomains.blocks[len(sparse) :])
         near = partial(near_stiffness, sparse, rigid) if any_rank(comm, bool(stiff)) else None
         hard = any_rank(comm, 3 in stiff)
@@ -211,10 +217,11 @@ def chosen_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
     """Dirichlet's, or a late one where S is dear. Collective.
 
     Where a subdomain keeps its volume, or springs hold one, the lumped one takes many times as many
-    steps; there, in clusters, and beside other Blocks it is Dirichlet's.
+    steps; there, in tangents, in clusters, and beside other Blocks it is Dirichlet's.
     """
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     other = subdomains.num_clusters > 0 or len(sparse) < len(subdomains.elastic)
+    other = other or subdomains.tangents
     dear = any(block.stiffness.entries > CHOICE.dear * block.stiffness.size for block in sparse)
     held = any(block.kernel.shape[1] < block.modes.shape[1] for block in sparse)
     stiff = any(block.stiffness.stretch_over_shear > CHOICE.volume for block in sparse)

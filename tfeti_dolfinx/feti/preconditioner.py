@@ -42,8 +42,8 @@ class SmoothingParameters:
 
     steps: int = 3
     range: float = 8.0
-    many_steps: int = 8
-    wide_range: float = 50.0
+    many_steps: int = 12
+    wide_range: float = 100.0
     high: float = 5.0
     exact: float = 1e-2
     dense: int = 20

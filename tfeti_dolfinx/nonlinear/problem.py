@@ -39,10 +39,13 @@ class NewtonTolerances:
         safety: What the next increment is expected to be is multiplied with, before it is compared
             with the tolerance.
         forcing: Share of the expected increment to which a linearised problem is solved (the
-            forcing term of Eisenstat and Walker).
-        loosest: Relative tolerance of a linearised problem at most.
-        rough: Of both in finite strain, where a rough displacement opens contacts that the next
-            step has to close again, and makes tangents and places anew.
+            forcing term of Eisenstat and Walker); None: 1.5, in finite strain 0.3, where a rough
+            displacement opens contacts that the next step has to close again, and makes tangents
+            and places anew.
+        loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
+            0.01.
+        steepest: In small strain the next increment is expected to be at least this share of the
+            last one, as slopes along one step cannot see all that is left.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the scene, in finite strain: less is rounding of where bodies are.
@@ -78,9 +81,9 @@ class NewtonTolerances:
 
     max_it: int = 50
     safety: float = 10.0
-    forcing: float = 1.5
-    loosest: float = 0.05
-    rough: float = 0.2
+    forcing: float | None = None
+    loosest: float | None = None
+    steepest: float = 0.1
     nothing: float = 1e-12
     nowhere: float = 1e-13
     final: float = 0.2
@@ -188,11 +191,9 @@ class NonlinearContactProblem(ContactProblem):
             tolerances = NewtonTolerances() if tolerances is None else tolerances
             checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")
             given["tolerances"] = asdict(tolerances)
-        if finite:
-            forcing, loosest = tolerances.forcing, tolerances.loosest
-            rough = tolerances.rough
-            tolerances = replace(tolerances, forcing=rough * forcing, loosest=rough * loosest)
         self._tolerances = tolerances
+        self._forcing = tolerances.forcing or (0.3 if finite else 1.5)
+        self._loosest = tolerances.loosest or (0.01 if finite else 0.1)
         self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
@@ -204,7 +205,7 @@ class NonlinearContactProblem(ContactProblem):
         length = bcast_from_root(decomposition.comm, diameter(decomposition))
         self._least = self._tolerances.nowhere * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
-        self._last_increment = self._tolerances.loosest
+        self._last_increment = self._loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
         self._diagnostics.finite = self._finite
         self._has_own_tangent = J is not None and not finite
@@ -251,7 +252,7 @@ class NonlinearContactProblem(ContactProblem):
 
     def _newton(self, total: Totals) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
-        forms, expected = self._newton_forms, self._last_increment
+        forms, asked = self._newton_forms, self._last_increment
         faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
         keeping = self._keeping
         keeping.begin()
@@ -259,7 +260,7 @@ class NonlinearContactProblem(ContactProblem):
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
-            rtol = float(np.clip(tol.forcing * expected, tol.final * exact, tol.loosest))
+            rtol = float(np.clip(self._forcing * asked, tol.final * exact, self._loosest))
             try:
                 self._solve_linearised(rtol)
             except OverlapError as error:  # that of an iterate, not of what was given
@@ -275,10 +276,11 @@ class NonlinearContactProblem(ContactProblem):
             increment = size / max(largest(comm, self.u.x.array), TINY)
             # 2. line search
             t, remainder = self._line_search(u, d)
-            expected = min(remainder, 1.0) * increment
+            expected = asked = min(remainder, 1.0) * increment
             # 3. end
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
+                asked = max(expected, tol.steepest * increment)
                 short |= t == 1.0 and tol.safety * expected <= exact
             nothing = largest(comm, end) <= max(tol.nothing * first, self._least)
             if nothing or (short and rtol <= exact):
@@ -286,7 +288,7 @@ class NonlinearContactProblem(ContactProblem):
                 return
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
-                self._last_increment = min(increment, tol.loosest)
+                self._last_increment = min(increment, self._loosest)
             if t < 1.0 or keeping.is_slow(size) or size > tol.other * keeping.before:
                 faster.forget()  # a model that does not hold along d tells nothing of the next
             plain = t < 1.0 or step == 0 or not (self._finite or forms.kept)

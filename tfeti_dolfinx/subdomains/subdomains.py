@@ -105,6 +105,7 @@ class Subdomains:
         elastic: The Blocks that have nodes, which are no rigid bodies, and num_nodal the number of
             their unknowns; those behind are of rigid bodies.
         num_modes: k; num_clusters: clusters on all ranks, 0 without.
+        tangents: Whether stiffnesses are tangents of nonlinear materials.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         elastic_parts: Each of the Blocks that have nodes, with its part of the n unknowns.
         size: n.
@@ -114,6 +115,7 @@ class Subdomains:
     """
 
     num_clusters = 0
+    tangents = False
 
     def __init__(
         self,
