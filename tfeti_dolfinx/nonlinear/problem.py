@@ -44,8 +44,9 @@ class NewtonTolerances:
             and places anew.
         loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
             0.01.
-        steepest: In small strain the next increment is expected to be at least this share of the
-            last one, as slopes along one step cannot see all that is left.
+        steepest, flattest: In small strain forcing expects the next increment to be between these
+            shares of the last one: the slope along one step does not see all that is left, and at
+            that of a kept tangent a new one would be solved to more than it moves.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the scene, in finite strain: less is rounding of where bodies are.
@@ -84,6 +85,7 @@ class NewtonTolerances:
     forcing: float | None = None
     loosest: float | None = None
     steepest: float = 0.1
+    flattest: float = 0.25
     nothing: float = 1e-12
     nowhere: float = 1e-13
     final: float = 0.2
@@ -280,7 +282,7 @@ class NonlinearContactProblem(ContactProblem):
             # 3. end
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
-                asked = max(expected, tol.steepest * increment)
+                asked = float(np.clip(remainder, tol.steepest, tol.flattest)) * increment
                 short |= t == 1.0 and tol.safety * expected <= exact
             nothing = largest(comm, end) <= max(tol.nothing * first, self._least)
             if nothing or (short and rtol <= exact):
