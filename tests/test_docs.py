@@ -1,7 +1,6 @@
 """Documents: every program and every command in them runs, and nothing they name is missing."""
 
 import dataclasses
-import inspect
 import os
 import re
 import shlex
@@ -14,10 +13,6 @@ import pytest
 from quick_demos import alone
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.bem.steklov import StiffnessTolerances
-from tfeti_dolfinx.feti.dual import DualLimits
-from tfeti_dolfinx.mesh.partition import UNKNOWNS
-from tfeti_dolfinx.mortar.tolerances import SearchTolerances
 
 ROOT = Path(__file__).resolve().parents[1]
 MADE = ("examples", "api")  # folders that Sphinx fills
@@ -239,35 +234,6 @@ def test_the_package_installs(serial_only, tmp_path):
     (metadata,) = site.glob("tfeti_dolfinx-*.dist-info/METADATA")
     assert "License-Expression: MIT\n" in metadata.read_text()
     assert f"Version: {tfeti.__version__}\n" in metadata.read_text()
-
-
-HALVINGS = inspect.signature(tfeti.LoadSteps).parameters["max_halvings"].default
-OF_THE_CODE = [
-    ("load_steps", r"kept, up to (\d+) of them", DualLimits.recycled),
-    ("dynamics", r"kept, (\d+) of them", DualLimits.recycled),
-    ("options", r"auto: (\d+) from the second solve", DualLimits.recycled),
-    ("load_steps", r"`max_halvings` \((\d+)\)", HALVINGS),
-    ("tutorial", r"`reach` \((\d+) % of", 100 * SearchTolerances.reach),
-    ("boundary_elements", r"wrong by more than (\d+) %", 100 * StiffnessTolerances.wrong),
-    ("guide/speed", r"`decompose` takes about (\d+) unknowns", UNKNOWNS),
-    ("howto/ranks", r"gets about (\d+) unknowns", UNKNOWNS),
-]
-
-
-@pytest.mark.parametrize(("page", "figure", "value"), OF_THE_CODE)
-def test_a_page_says_what_the_code_takes(page, figure, value):
-    (said,) = re.findall(figure, (ROOT / f"docs/{page}.md").read_text())
-    assert float(said) == pytest.approx(value)
-
-
-@pytest.mark.parametrize("page", ["README.md", "docs/guide/speed.md"])
-def test_the_price_of_contact_is_that_of_the_table(page):
-    """The column *of GAMG* of contact by block Newton, of both scenes."""
-    rows = (ROOT / "docs/developers/performance.md").read_text().splitlines()
-    prices = [float(row.split("|")[-3]) for row in rows if row.startswith("| contact, newton |")]
-    assert len(prices) == 2
-    said = f"{min(prices):.1f} to {max(prices):.1f} times as much as a linear solve by multigrid"
-    assert said in (ROOT / page).read_text()
 
 
 def test_one_version():

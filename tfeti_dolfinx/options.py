@@ -106,13 +106,13 @@ class Options:
         choices=LOCAL_TYPES,
     )
     local_multiplications: int = described(
-        50, "subdomains", "multiplications to expect, for that count", fits=FROM_0
+        50, "subdomains", "iterations to expect, for that count", fits=FROM_0
     )
     clusters: int = described(
         0,
         "subdomains",
-        "number of clusters of subdomains (hybrid TFETI): a smaller coarse problem, for more than "
-        "some 2000 subdomains; 0: none",
+        "number of clusters of subdomains (hybrid TFETI): a smaller coarse problem, for very "
+        "many subdomains; 0: none",
         fits=FROM_0,
     )
     recycle: int | str = described(
