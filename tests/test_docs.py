@@ -139,6 +139,26 @@ def test_a_linear_problem_becomes_contact_in_nine_lines(own_folder, program):
     run_program(after + "\nassert problem.solution.contact().force.sum() > 0.0", "after")
 
 
+# commands of user pages that no test here starts, and why
+NOT_RUN = {
+    "python3 -m venv ": "the package is installed by test_the_package_installs",
+    "venv/bin/python -m pip install .": "the same",
+    "./run python3 -m pytest": "these tests; .ci/run starts them so",
+    "./run python3 -m sphinx ": ".ci/run builds the documents, with -W",
+}
+DIRECTIVES = ("{toctree}", "{eval-rst}")
+
+
+def test_every_block_of_a_user_page_is_run_or_has_a_reason():
+    run = {f"./run {line}" for line in commands()}
+    for path in USER_PAGES:
+        for language, text in re.findall(r"^```(\S*)\n(.*?)^```", path.read_text(), re.S | re.M):
+            known = language in (*DIRECTIVES, "python") or (language, path) == ("diff", CONVERTED)
+            sample = (language, path.name) == ("text", "report.md")  # tests/test_figures.py
+            lines = [] if known or sample else text.splitlines()
+            assert not [s for s in lines if s not in run and not s.startswith(tuple(NOT_RUN))], path
+
+
 def words(path):
     """Of a page, but for tables that a benchmark or the code makes, and programs."""
     text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
