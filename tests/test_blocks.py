@@ -58,18 +58,6 @@ def block(K, x, every=3, counters=None, **changes):
     return SparseBlock(data(K, x, every, **changes), InverseFactory(counters or Counters()))
 
 
-@pytest.mark.parametrize(
-    ("cell", "degree"),
-    [("triangle", 2), ("quadrilateral", 1), ("tetrahedron", 1), ("hexahedron", 2)],
-)
-def test_blocks_fulfil_their_contract(cell, degree):
-    K, x = stiffness(cell, 2, degree)
-    b = block(K, x)
-    check_block(b, K)
-    assert b.kernel.shape[1] == RIGID[cell]
-    b.destroy()
-
-
 @pytest.mark.parametrize(("what", "left"), [("scalar", 1), ("mass", 0), ("spring", 3)])
 def test_the_kernel_is_what_the_form_leaves_free(what, left):
     """A spring along z leaves two translations and a turn."""

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, gathered, held, searched, sided, stacked, two_body_problem
+from bodies import boxes, gathered, searched, sided, stacked
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import decomposed, hooke, problem, strain
-from test_mortar_cases import disc_on_block, no_load
 
 import tfeti_dolfinx as tfeti
 from meshes.rings import MIDDLE, lame_pressure, rings
@@ -78,55 +77,6 @@ def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
             gaps = gathered(searched([sided(*sides)], dofs_of(d)).gap)
             assert len(gaps) > 0
             assert np.allclose(gaps, gap * size, rtol=1e-2, atol=0.0)
-
-
-# what keeps both bodies where they are: sides without normal displacement, springs everywhere
-HOLDS = {
-    "loose": (("lower bottom",), 0.0),
-    "held": (("lower bottom", "upper top"), 0.0),
-    "springs": ((), 1e-3),
-}
-NO_PRESSURE = 1e-6  # of E, which is 1
-
-
-def unloaded(d, hold, contact, degree=1):
-    """Two bodies without load, the upper one free to fall, held, or both on springs."""
-    names, springs = HOLDS[hold]
-    across = ("left", "front")[: d.mesh.geometry.dim - 1]
-    names += tuple(f"{body} {side}" for body in ("lower", "upper") for side in across)
-    V = fem.functionspace(d.mesh, ("Lagrange", degree, (d.mesh.geometry.dim,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * degree})
-    spring = fem.Constant(d.mesh, springs)
-    a = ufl.inner(hooke()(u), strain(v)) * dx + spring * ufl.dot(u, v) * dx
-    return tfeti.ContactProblem(a, no_load(v, None), held(d, *names)(V), [contact], d)
-
-
-def check_at_rest(p):
-    p.solve()
-    assert p.report.contact_rows > 0
-    assert np.all(gathered(p.solution.contact().pressure) < NO_PRESSURE)
-    assert np.abs(gathered(p.u.x.array)).max() < NO_PRESSURE
-
-
-@pytest.mark.parametrize(
-    ("cell", "n", "curvatures", "sides", "hold"),
-    [
-        ("triangle", (2, 16), (0.025, 0.4), ORDERS[0], "loose"),
-        ("quadrilateral", (3, 8), (-0.3, 0.3), ORDERS[1], "springs"),
-        ("tetrahedron", (1, 8), (0.0, 0.4), ORDERS[0], "held"),
-        ("hexahedron", (8, 1), (-0.4, 0.0), ORDERS[1], "loose"),
-    ],
-)
-def test_bodies_that_only_touch_do_not_push_each_other(cell, n, curvatures, sides, hold):
-    """Mesh ratios 1/8 to 8, flat, convex and concave sides, either one secondary."""
-    check_at_rest(unloaded(bent(cell, *n, *curvatures), hold, sided(*sides, reach=0.5)))
-
-
-@pytest.mark.parametrize(("sides", "order"), [(("arc", "top"), 2), (("top", "arc"), 1)])
-def test_a_disc_on_a_block_does_not_push_it(comm, sides, order):
-    d, bcs = disc_on_block(comm, order, pushed=0.0)
-    check_at_rest(two_body_problem(d, no_load, bcs, [sided(*sides, reach=0.3)], degree=order))
 
 
 @pytest.mark.parametrize(

@@ -296,6 +296,8 @@ CASES = {
         rf"motion and load\[0\]\[1\] is 0.02{ON}0.01 on rank 0",
     ),
     "stabilised on one": (thrown(stabilised=(False, True)), rf"stabilised is True{ON}False"),
+    "a step of another size on one": (thrown(step=(0.1, 0.2)), rf"step is 0.2{ON}0.1 on rank 0"),
+    "no step on one": (thrown(step=(0.1, np.nan)), "step=nan"),
 }
 
 

@@ -13,7 +13,6 @@ from bodies import (
     pressed,
     searched,
     sided,
-    stacked,
     two_body_problem,
 )
 from dolfinx import fem
@@ -137,16 +136,6 @@ def test_edges_are_warned_of(caplog):
     p = two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")])
     p.solve()
     assert ("'corner' has edges" in caplog.text) == (d.comm.rank == 0)
-
-
-def test_a_pair_without_conditions_has_empty_data():
-    d = stacked("quadrilateral", 3, 4, 4, gap=0.5)
-    bcs = held(d, "lower bottom", "lower left", "upper top", "upper left")
-    p = two_body_problem(d, pressed(d), bcs, [PAIR])
-    p.solve()
-    assert len(p.solution.contact(0).force) == 0
-    with pytest.raises(tfeti.InputError, match="contact 1: there are 1, counted from 0"):
-        p.solution.contact(1)
 
 
 def test_options_that_did_not_reach_petsc(monkeypatch):

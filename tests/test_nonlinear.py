@@ -155,26 +155,6 @@ def plastic(comm, hardening=0.05, n=4, gdim=2, **more):
     return problem, law, value
 
 
-def test_series_goes_on_from_its_checkpoint(comm, shared_tmp):
-    """Load steps with internal variables: stopped, resumed, the same as in one run."""
-    times = [1.0, 2.0]
-
-    def series(until, folder, resume=False):
-        problem, law, value = plastic(comm)
-
-        def apply(_, t):
-            value.value[-1] = -0.06 * np.sin(0.6 * t)
-
-        steps = tfeti.LoadSteps(problem, apply, times[:until], checkpoint=shared_tmp / folder)
-        steps.run(resume=resume)
-        return problem.u.x.array.copy(), law.p.x.array.copy()
-
-    whole = series(2, "whole")
-    series(1, "parts")
-    for found, expected in zip(series(2, "parts", resume=True), whole, strict=True):
-        assert np.abs(found - expected).max(initial=0.0) < 1e-7 * 0.06
-
-
 def test_only_subdomains_with_a_new_tangent_are_factored_again(comm):
     """Of four layers the lowest yields: each new tangent costs its two factors."""
     mesh, tags = block(2, 8, 0.05, comm)
@@ -218,20 +198,6 @@ def test_rows_and_their_multipliers_outlive_the_tangent(comm):
     contacts = [p.solution.contact(0) for p in (problem, other)]
     force, expected = (contact.resultant.force for contact in reversed(contacts))
     assert np.abs(force - expected).max() < 1e-12 * np.abs(expected).max()
-
-
-def test_a_step_that_is_given_up_leaves_no_trace(comm):
-    """What was not accepted is gone after ``go_back``: displacement and internal variables."""
-    problem, law, value = plastic(comm)
-    value.value[-1] = -0.05
-    problem.solve()
-    problem.accept()
-    u, p = problem.u.x.array.copy(), law.p.x.array.copy()
-    value.value[-1] = -0.09
-    problem.solve()
-    problem.go_back()
-    assert np.array_equal(problem.u.x.array, u)
-    assert np.array_equal(law.p.x.array, p)
 
 
 def test_perfect_plasticity_keeps_the_stress_below_yield(comm):

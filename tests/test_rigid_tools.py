@@ -303,30 +303,6 @@ def test_load_steps_take_laws_of_time_and_write_a_table(tmp_path):
     assert np.isclose(back[-1].tools["ball displacement y"], -0.04, rtol=1e-5)
 
 
-def test_a_series_goes_on_from_its_checkpoint(tmp_path):
-    """The tool begins where it was, by the force that it has had: friction knows the way."""
-    scene = block(2)
-    folder = scene["decomposition"].comm.bcast(str(tmp_path / "kept"))
-    way = lambda t: (0.01 * t, 0.0)  # noqa: E731
-    ends = []
-    for times in ([1.0, 2.0, 3.0], [1.0, 2.0], [1.0, 2.0, 3.0]):
-        tool = tfeti.RigidBody(
-            ball(2), displacement=way, force=(0, -0.01), free=("y",), name="ball"
-        )
-        contact = tfeti.Obstacle("top", tool, friction=tfeti.Coulomb(0.3))
-        problem = tfeti.ContactProblem(**scene, contacts=[contact], petsc_options=TIGHT)
-        steps = tfeti.LoadSteps(
-            problem, lambda problem, t: None, times, checkpoint=folder + "_whole" * (not ends)
-        )
-        steps.run(resume=len(ends) == 2)
-        ends.append((problem, steps))
-    (whole, first), _, (resumed, second) = ends
-    assert len(second.records) == 3
-    assert same(whole, resumed)
-    for name, value in first.records[-1].tools.items():
-        assert np.isclose(second.records[-1].tools[name], value, atol=1e-11), name
-
-
 def test_a_tool_that_hits_is_a_body_that_falls():
     """Galilei: a plane that comes with a velocity, and a square that has the opposite one."""
     scene, speed, found = {**block(2, n=4), "bcs": []}, 0.2, []

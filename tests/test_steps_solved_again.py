@@ -73,15 +73,3 @@ def test_a_state_is_gone_on_from_with_another_density():
         other.problem.restore(state)
         found = other.solve(0.1, {"density": 0.5})
         assert np.allclose(found, anew, rtol=0, atol=100 * RTOL)
-
-
-def test_a_step_of_another_size_on_another_rank():
-    """Each rank would solve for a step of its own."""
-    scene = Stretched(False)
-    comm = scene.problem.decomposition.comm
-    if comm.size == 1:
-        pytest.skip("needs two ranks")
-    with pytest.raises(tfeti.InputError, match="step is 0.2 on rank 1 and 0.1 on rank 0"):
-        scene.problem.take_step(0.2 if comm.rank == 1 else 0.1)
-    with pytest.raises(tfeti.InputError, match="step=nan"):
-        scene.problem.take_step(np.nan if comm.rank == 1 else 0.1)
