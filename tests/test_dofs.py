@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from bodies import stacked
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import box, decomposed
 
-import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -75,15 +75,6 @@ def test_lookup_of_copies_finds_all_of_them_with_their_values():
 
 
 def test_coincident_nodes_of_two_bodies_are_two_groups():
-    from dolfinx import mesh as dmesh
-
-    comm = MPI.COMM_WORLD
-    square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=float)
-    x, cells = np.concatenate((square, square + [1, 0])), np.arange(8).reshape(2, 4)
-    if comm.rank:
-        x, cells = x[:0], cells[:0]
-    element = decomposed("quadrilateral", 1, 1).mesh.ufl_domain().ufl_coordinate_element()
-    mesh = dmesh.create_mesh(comm, cells=cells.astype(np.int64), x=x, e=element)
-    d = tfeti.decompose(mesh, 2)
+    d = stacked("quadrilateral", 1, 1, 2)
     dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
-    assert comm.allreduce(dofs.num_groups) == 8
+    assert d.comm.allreduce(dofs.num_groups) == 8
