@@ -134,6 +134,8 @@ def test_the_sample_of_a_report_is_what_a_demo_prints(quick_demo, serial_only):
 
 # what is no figure: names, dimensions, status and codes, what a page gives to a program or states
 GIVEN = [
+    r"(io4dolfinx|adios4dolfinx|scifem|setuptools ≥|beside) [\d.]+\d( and [\d.]+\d)?",
+    r"io4dolfinx|adios4dolfinx|h5py",
     r"\b[1-3]D\b",
     r"[Dd]egrees? [12](?: and 2)?\b",
     r"DOLFINx(?: ≥)? 0\.\d+",
