@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 import demos
 import tfeti_dolfinx as tfeti
@@ -166,3 +167,26 @@ def test_tools_balance_and_a_drawn_sheet_springs_back(quick_demo):
     assert abs(errors["balance_of_tools"]) <= 1e-4
     assert abs(errors["balance_of_work"]) <= 0.25  # two steps: the work is a rough sum
     assert 0.5 < errors["springback_degrees"] < 3.0
+
+
+@pytest.mark.parametrize(
+    "words", [["--quick"], pytest.param([], marks=pytest.mark.slow)], ids=["quick", "default"]
+)
+def test_a_half_ball_of_rubber_is_right_to_a_hundred_thousandth_of_its_radius(words, comm):
+    """Beside tight tolerances; at the demo's own few tangents a load step and multiplications."""
+    made = demos.scene("rubber_pressed_3d", words, "NonlinearContactProblem")
+    u, down, ends = made["u"], made["bcs"][0].g, []
+    for options in (made.pop("petsc_options"), {"tfeti_rtol": 1e-8}):
+        u.x.array[:], found, reports = 0.0, [], []
+        problem = tfeti.NonlinearContactProblem(**made, petsc_options=options)
+        for depth in np.linspace(0.0, 0.4, 3 if words else 9)[1:]:
+            down.value[2] = -depth
+            problem.solve()
+            problem.accept()
+            found.append(np.array(u.x.array))
+            reports.append(problem.report)
+        ends.append((np.array(found), reports))
+    (found, reports), (tight, _) = ends
+    assert comm.allreduce(float(np.abs(found - tight).max(initial=0.0)), op=MPI.MAX) <= 1e-5
+    assert max(report.assemblies for report in reports) <= 5
+    assert sum(report.F_multiplications for report in reports) <= 548

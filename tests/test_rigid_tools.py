@@ -374,46 +374,86 @@ def test_two_tools_have_two_names():
         solved(block(2, n=2), *(tfeti.Obstacle("top", tool) for tool in tools))
 
 
+def nonlinear(finite, tool):
+    """Problem of a tool on a block: plasticity in small strain, neo-Hooke's law in finite strain."""
+    decomposition = decomposed("triangle", 6, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    state = {}
+    if finite:
+        residual = ufl.derivative(neo_hooke(u, 1.0, 0.3) * ufl.dx, u, v)
+    else:
+        elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
+        steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.05, hardening=0.1)
+        residual = steel.residual(v)
+        state = {"state": steel.state, "update": steel.update}
+        state["J"] = steel.tangent(ufl.TrialFunction(V), v)
+    return tfeti.NonlinearContactProblem(
+        residual,
+        u,
+        [clamp(V, decomposition.facets("bottom"))],
+        [tfeti.Obstacle("top", tool)],
+        decomposition,
+        finite=finite,
+        petsc_options={"rtol": 1e-9},
+        **state,
+    )
+
+
+def pressed(finite, shape, **given):
+    """Solution of one load step, whose tool acts about the middle of the top."""
+    tool = tfeti.RigidBody(shape, name="tool", **{"point": (0.5, 1.0), **given})
+    problem = nonlinear(finite, tool)
+    tfeti.LoadSteps(problem, lambda problem, t: None, [1.0]).run()
+    assert problem.report.newton_steps > 1
+    return problem, problem.solution.tool("tool")
+
+
 @pytest.mark.parametrize("finite", [False, True])
 def test_nonlinear_bodies_under_a_tool_by_force_and_by_displacement(finite):
-    """Plasticity in small strain, and neo-Hooke's law in finite strain."""
-    found, force = [], None
-    for law in ("displacement", "force"):
-        decomposition = decomposed("triangle", 6, 4)
-        V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-        u, v = fem.Function(V), ufl.TestFunction(V)
-        state = {}
-        if finite:
-            residual = ufl.derivative(neo_hooke(u, 1.0, 0.3) * ufl.dx, u, v)
-        else:
-            elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
-            steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.05, hardening=0.1)
-            residual = steel.residual(v)
-            state = {"state": steel.state, "update": steel.update}
-            state["J"] = steel.tangent(ufl.TrialFunction(V), v)
-        given = {"displacement": lambda t: (0.0, -0.08 * t)}
-        if law == "force":
-            given = {"force": (0.0, -force), "free": ("y",)}
-        tool = tfeti.RigidBody(ball(2, radius=0.8), name="ball", point=(0.5, 1.0), **given)
-        problem = tfeti.NonlinearContactProblem(
-            residual,
-            u,
-            [clamp(V, decomposition.facets("bottom"))],
-            [tfeti.Obstacle("top", tool)],
-            decomposition,
-            finite=finite,
-            petsc_options={"rtol": 1e-9},
-            **state,
-        )
-        tfeti.LoadSteps(problem, lambda problem, t: None, [1.0]).run()
-        tool = problem.solution.tool("ball")
-        force = tool.resultant.force[1] if law == "displacement" else force
-        found.append((problem, tool))
-    (one, by_law), (other, by_force) = found
+    shape = ball(2, radius=0.8)
+    one, by_law = pressed(finite, shape, displacement=lambda t: (0.0, -0.08 * t))
+    force = by_law.resultant.force[1]
+    other, by_force = pressed(finite, shape, force=(0.0, -force), free=("y",))
     assert np.isclose(by_force.displacement[1], by_law.displacement[1], rtol=1e-7)
     assert same(one, other, 1e-6)
     assert np.isclose(by_force.resultant.force[1], force, rtol=1e-7)
-    assert min(one.report.newton_steps, other.report.newton_steps) > 1
+
+
+@pytest.mark.parametrize("finite", [False, True])
+def test_a_plate_on_a_nonlinear_body_finds_its_tilt(finite):
+    """The force is off the middle: no moment about it is left, and the law of that motion agrees."""
+    given = {"force": (0.0, -0.06), "free": ("y", "rz"), "point": (0.6, 1.0)}
+    one, tilted = pressed(finite, top(2), **given)
+    assert tilted.rotation[2] < -0.02
+    assert np.isclose(tilted.resultant.force[1], 0.06, rtol=1e-7)
+    assert abs(tilted.resultant.moment[2]) <= 1e-8
+    motion = {"displacement": tilted.displacement[:2], "rotation": tilted.rotation[2]}
+    other, by_law = pressed(finite, top(2), point=(0.6, 1.0), **motion)
+    assert same(one, other, 1e-6)
+    assert np.isclose(by_law.resultant.force[1], 0.06, rtol=1e-6)
+
+
+@pytest.mark.parametrize("finite", [False, True])
+def test_a_tool_that_no_nonlinear_body_balances_is_named(finite):
+    tool = tfeti.RigidBody(top(2), name="punch", force=(0.01, -0.01), free=("x", "y"))
+    with pytest.raises(tfeti.NoSolutionError, match="punch.*translation in x"):
+        nonlinear(finite, tool).solve()
+
+
+@pytest.mark.parametrize("kind", ["linear", "nonlinear"])
+def test_a_tool_without_mass_is_named_in_dynamics(kind):
+    scene, mass = block(2, n=2), {"mass": 1.0}
+    contacts = [tfeti.Obstacle("top", tfeti.RigidBody(top(2), force=(0, -1), free=("y",)))]
+    with pytest.raises(tfeti.InputError, match="free motions in a ContactDynamics"):
+        if kind == "linear":
+            tfeti.ContactDynamics(**scene, contacts=contacts, **mass)
+        else:
+            v = scene["a"].arguments()[0]
+            u = fem.Function(v.ufl_function_space())
+            F = ufl.derivative(neo_hooke(u, 1.0, 0.3) * ufl.dx, u, v)
+            given = {"bcs": scene["bcs"], "decomposition": scene["decomposition"], **mass}
+            tfeti.NonlinearContactDynamics(F, u, contacts=contacts, finite=True, **given)
 
 
 def test_a_tool_that_is_lifted_leaves_an_elastic_body_at_rest():
