@@ -375,7 +375,7 @@ def test_two_tools_have_two_names():
 
 
 def nonlinear(finite, tool):
-    """Problem of a tool on a block: plasticity in small strain, neo-Hooke's law in finite strain."""
+    """Problem of a tool on a block: J2 in small strain, neo-Hooke in finite strain."""
     decomposition = decomposed("triangle", 6, 4)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
@@ -422,7 +422,7 @@ def test_nonlinear_bodies_under_a_tool_by_force_and_by_displacement(finite):
 
 @pytest.mark.parametrize("finite", [False, True])
 def test_a_plate_on_a_nonlinear_body_finds_its_tilt(finite):
-    """The force is off the middle: no moment about it is left, and the law of that motion agrees."""
+    """No moment about the force, off the middle, is left; the law of that motion agrees."""
     given = {"force": (0.0, -0.06), "free": ("y", "rz"), "point": (0.6, 1.0)}
     one, tilted = pressed(finite, top(2), **given)
     assert tilted.rotation[2] < -0.02
