@@ -10,6 +10,7 @@ from mpi4py import MPI
 from reference.active_set import dense_qp
 from scipy.sparse import diags_array
 
+from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
@@ -171,3 +172,31 @@ def test_smalse_converges_whatever_M_and_beta_are(seed, beta, exponent):
     stopped = smalse(qp, homogenised, to(1e-12, homogenised), parameters, max_it=3)
     assert stopped.reason == ConvergedReason.DIVERGED_ITS
     assert stopped.steps.inner == 3
+
+
+# the fixed step of MPRGP, ᾱ = 1.95/‖·‖ in the default options, diverges where the estimate of ‖PFP‖
+# is too small: ‖A‖ᾱ ≤ 2 needs 0.975 of the norm
+LEAST, MOST = 0.975, 1.1
+SIZE = 60
+
+SPECTRA = {
+    "one eigenvalue apart": np.append(np.linspace(0.1, 1.0, SIZE - 1), 5.0),
+    "evenly spread": np.linspace(0.01, 1.0, SIZE),
+    "two close at the top": np.append(np.linspace(0.0, 0.5, SIZE - 2), [0.99, 1.0]),
+    "crowded at the top": 1.0 - np.linspace(0.0, 1.0, SIZE) ** 2,
+    "all the same": np.ones(SIZE),
+    "a single one": np.append(np.zeros(SIZE - 1), 3.0),
+    "fourteen orders": np.logspace(-14, 0, SIZE),
+    "tiny": 1e-12 * np.linspace(0.01, 1.0, SIZE),
+}
+
+
+@pytest.mark.parametrize("kind", list(SPECTRA))
+def test_norm_of_any_spectrum(kind):
+    """A symmetric matrix of these eigenvalues in a random basis."""
+    basis, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((SIZE, SIZE)))
+    F = (basis * SPECTRA[kind]) @ basis.T
+    coarse = DenseCoarse(np.zeros((0, SIZE)), np.zeros(0))
+    estimate = estimate_norm(matrix(F), coarse, Options().norm_steps)
+    exact = np.linalg.norm(F, 2)
+    assert LEAST * exact <= estimate <= MOST * exact, estimate / exact
