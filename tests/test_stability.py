@@ -1,5 +1,7 @@
 """Each row of the stability benchmark is right, warned of or named; warnings say what they must."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bodies import boxes
@@ -14,25 +16,28 @@ from tfeti_dolfinx.accuracy.diagnostics import flatness
 
 QUICK = ("stiff on soft", "loose stack", "cells", "P1", "layers at contact", "strips", "hinge")
 QUICK += ("two obstacles", "grazing", "frictionless", "Tresca, moduli", "Coulomb, nu")
+QUICK += ("far obstacle", "beam", "subdomains of a body")
 
 
 def rungs():
     for ladder in LADDERS:
         for cell in ladder.cells:
-            for k, value in enumerate(ladder.values):
-                quick = ladder.name in QUICK and cell == "triangle" and k == len(ladder.values) - 1
+            for value in ladder.values:
+                quick = ladder.name in QUICK and cell == "triangle"
                 marks = [] if quick else [pytest.mark.slow]
                 name = f"{ladder.group}, {ladder.name}, {cell} {label(ladder, value)}"
-                yield pytest.param(ladder, cell, value, id=name, marks=marks)
+                right = quick and ladder.name != "hinge"
+                yield pytest.param(ladder, cell, value, right, id=name, marks=marks)
 
 
-@pytest.mark.parametrize(("ladder", "cell", "value"), list(rungs()))
-def test_a_row_is_right_or_warned_of_or_named(ladder, cell, value, comm):
+@pytest.mark.parametrize(("ladder", "cell", "value", "right"), list(rungs()))
+def test_a_row_is_right_or_warned_of_or_named(ladder, cell, value, right, comm):
     scene = ladder.rung(cell, value)
     row = run_scene(scene, comm)
     if comm.rank == 0:
         found = stability.verdict(scene, row)
         assert found.islower(), row
+        assert found == "right" or not right, row
         assert found in ("right", "warned", "not judged") or stability.said(row)
 
 
@@ -146,3 +151,47 @@ def test_bodies_that_a_mesh_joins_in_nodes_alone_are_named(comm):
             found = warnings_of("in nodes alone (1)", row["warnings"])
             assert len(found) == joined
             assert all(warning.startswith("body 0, body 1: ") for warning in found)
+
+
+@pytest.mark.parametrize("away", [1.0, 1e6])
+def test_rows_of_an_obstacle_far_away_change_nothing(away):
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, -away), (0, 1)), reach=np.inf)
+    d = decomposed("quadrilateral", 6, 4)
+    alone, p = (problem(d, (0.0, 1e-6), contacts) for contacts in ([], [floor]))
+    alone.solve()
+    try:
+        p.solve()
+    except tfeti.ConvergenceError as error:
+        assert away > 1e3
+        assert "DIVERGED_ROUNDING" in str(error)  # noqa: PT017
+    else:
+        assert p.report.active_contacts == 0
+        size = np.abs(alone.u.x.array).max(initial=1e-8)
+        assert np.abs(p.u.x.array - alone.u.x.array).max(initial=0.0) <= 1e-4 * size
+
+
+def test_atol_is_a_length():
+    p = problem(decomposed("quadrilateral", 6, 4), tfeti_rtol=1e-14, tfeti_atol=1e-5)
+    p.solve()
+    assert p.report.converged_reason == "CONVERGED_ATOL"
+    assert p.report.residuals["gluing_jump"] <= 2e-5
+
+
+def test_rounding_is_called_so_with_all_warnings(comm):
+    scene = rung("beam", "triangle", 1e4)
+    row = run_scene(replace(scene, options={"tfeti_rtol": 1e-15}), comm)
+    if comm.rank == 0:
+        said = "ConvergenceError: the dual solver stopped: DIVERGED_ROUNDING"
+        assert row["error"].startswith(said)
+        assert "rounding does not let" in row["error"]
+        assert warnings_of("the flattest", row["warnings"])
+        assert all(warning in row["error"] for warning in row["warnings"])
+
+
+def test_rtol_0_asks_for_all_digits(comm):
+    """Whether rounding is said to have ended it or not, it has them."""
+    options = {"tfeti_rtol": 0.0, "tfeti_error_if_not_converged": False}
+    row = run_scene(replace(rung("cells", "triangle", 1e4), options=options), comm)
+    if comm.rank == 0:
+        assert row["reason"] in ("CONVERGED_RTOL", "DIVERGED_ROUNDING")
+        assert row["u"] <= 1e-10
