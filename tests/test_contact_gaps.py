@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-import ufl
 from bodies import boxes, gathered, searched, sided, stacked
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import decomposed, hooke, problem, strain
+from scenes import decomposed, problem
+from true_errors import OVERLAP, ring_problem
 
 import tfeti_dolfinx as tfeti
-from meshes.rings import MIDDLE, lame_pressure, rings
+from meshes.rings import lame_pressure
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import group_points
 
@@ -107,22 +107,6 @@ def test_an_overhanging_wedge(cell, slope):
     assert np.allclose(gaps, np.maximum(expected, 0.0), rtol=1e-3, atol=1e-12)
 
 
-def ring_problem(cells, overlap, order=1, degree=1, mesh=None, springs=1e-6, **contact):
-    """The rings; weak springs hold them against motions that contact leaves free."""
-    d = rings(MPI.COMM_WORLD, cells, order, overlap=overlap, **(mesh or {}))
-    V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * (degree + order) - 2})
-    spring = fem.Constant(d.mesh, springs)
-    a = ufl.inner(hooke()(u), strain(v)) * dx + spring * ufl.dot(u, v) * dx
-    L = ufl.dot(fem.Constant(d.mesh, (0.0, 0.0)), v) * dx
-    pair = tfeti.Contact("shaft", "hub", **contact)
-    return tfeti.ContactProblem(a, L, [], [pair], d, petsc_options={"rtol": 1e-8})
-
-
-OVERLAP = MIDDLE / 1500
-
-
 def against_lame(p):
     """Solve; relative error of the mean pressure, and of the pressure in L²."""
     p.solve()
@@ -145,7 +129,7 @@ def against_lame(p):
 )
 def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
     overlap = OVERLAP if contact.get("gap", "curved") == "curved" else 0.0
-    p = ring_problem(cells, overlap, order, order, mesh, secondary=secondary, **contact)
+    p = ring_problem(cells, order, mesh | {"overlap": overlap}, secondary=secondary, **contact)
     mean, error = against_lame(p)
     assert abs(mean) <= (0.005 if contact else 0.01)
     assert error <= (0.03 if contact else 0.05)
@@ -153,8 +137,8 @@ def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
 
 def test_free_rings_are_solved():
     """Rows hold the turn of one in the other by the errors of their normals, or not at all."""
-    mesh = {"subdomains": 8}
-    p = ring_problem((24, 32), OVERLAP, 2, 2, mesh, 0.0, secondary="hub")
+    mesh = {"subdomains": 8, "overlap": OVERLAP}
+    p = ring_problem((24, 32), 2, mesh, 0.0, secondary="hub")
     mean, _ = against_lame(p)
     assert p.report.converged_reason == "CONVERGED_RTOL"
     assert p.report.residuals["displacement_error"] <= 1e-8
