@@ -159,15 +159,10 @@ def test_rows_of_an_obstacle_far_away_change_nothing(away):
     d = decomposed("quadrilateral", 6, 4)
     alone, p = (problem(d, (0.0, 1e-6), contacts) for contacts in ([], [floor]))
     alone.solve()
-    try:
-        p.solve()
-    except tfeti.ConvergenceError as error:
-        assert away > 1e3
-        assert "DIVERGED_ROUNDING" in str(error)  # noqa: PT017
-    else:
-        assert p.report.active_contacts == 0
-        size = np.abs(alone.u.x.array).max(initial=1e-8)
-        assert np.abs(p.u.x.array - alone.u.x.array).max(initial=0.0) <= 1e-4 * size
+    p.solve()
+    assert p.report.active_contacts == 0
+    size = np.abs(alone.u.x.array).max(initial=1e-8)
+    assert np.abs(p.u.x.array - alone.u.x.array).max(initial=0.0) <= 1e-6 * size
 
 
 def test_atol_is_a_length():
