@@ -11,7 +11,7 @@ from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.feti.projectors import SemidefiniteFactor
+from tfeti_dolfinx.feti.projectors import NullModes, SemidefiniteFactor
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
@@ -60,7 +60,7 @@ def test_gluing_far_from_the_origin_holds_nothing():
     p.destroy()
 
 
-NO_NULL = csr_array((4, 0))
+NO_NULL = NullModes(csr_array((4, 0)))
 LAPLACIAN = np.diag([1.0, 2.0, 2.0, 1.0]) - np.diag(np.ones(3), 1) - np.diag(np.ones(3), -1)
 
 

@@ -25,7 +25,7 @@ from tfeti_dolfinx.feti.coarse import CoarseSpace, products, side_by_side
 from tfeti_dolfinx.feti.deflation import Balanced, Deflation, SoftModes, mean_stiffness
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.preconditioner import chebyshev
-from tfeti_dolfinx.feti.projectors import FaceFactors, SemidefiniteFactor, replicated
+from tfeti_dolfinx.feti.projectors import FaceFactors, NullModes, SemidefiniteFactor, replicated
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
@@ -226,7 +226,7 @@ class ClusterMotions:
         self._base = _gram(csr_array(self._rows[self._always]))
         self._whole = side_by_side(self._own.whole, self._Gt.getComm())
         self._width = self._whole.getSize()[1]
-        self.factors = FaceFactors(coarse.comm, csr_array((self._width, 0)), prefix)
+        self.factors = FaceFactors(coarse.comm, NullModes(csr_array((self._width, 0))), prefix)
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
         """M_f with these motions: Y = ZZᵀĜᵀ, C = XYᵀ, X of ``ClusterSteps``. Collective.

@@ -11,7 +11,13 @@ from scipy.sparse import csr_array, hstack
 from tfeti_dolfinx.common.arrays import Array, rows_times
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, ObliqueProjectors, SemidefiniteFactor
+from tfeti_dolfinx.feti.projectors import (
+    FaceFactors,
+    Grams,
+    NullModes,
+    ObliqueProjectors,
+    SemidefiniteFactor,
+)
 from tfeti_dolfinx.feti.rigid_bodies import (
     TOLERANCES,
     Bodies,
@@ -92,7 +98,7 @@ class CoarseSpace(Coarse):
         Gt = self._basis.rows(Gt, rows_times(self.J, self.row_size), equalities)
         self.null = bcast_from_root(comm, orthonormal_columns(self.motions @ both))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
-        self.factors = FaceFactors(comm, self.null, prefix)
+        self.factors = FaceFactors(comm, NullModes(self.null), prefix)
         self.factor = self.factors.factor(self.grams.whole, "whole")
         super().__init__(comm, Gt, np.zeros(0), self.factor.solve)
         self.e = self._load()
@@ -148,7 +154,7 @@ class CoarseSpace(Coarse):
             FactorError: Forces on the face do not determine what balances a load.
         """
         self.factors.count["face"] += int(self.dimension > 0)
-        return ObliqueProjectors(self.grams, face, C, self.null, self.comm)
+        return ObliqueProjectors(self.grams, face, C, self.factors.null, self.comm)
 
     def unresisted(
         self, rows: Array, within: Motions | None = None, below: float = TOLERANCES.null

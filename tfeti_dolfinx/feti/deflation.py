@@ -20,7 +20,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets, summed
 from tfeti_dolfinx.feti.coarse import CoarseSpace, transposed_G
 from tfeti_dolfinx.feti.operator import DualOperator
-from tfeti_dolfinx.feti.projectors import FaceFactors, Grams
+from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, NullModes
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import SoftMotions, Subdomains
@@ -144,7 +144,7 @@ class SoftModes:
         null = coarse.null
         if self.count:
             null = vstack([null, csr_array((self.count, null.shape[1]))], format="csr")
-        self.factors = FaceFactors(self._comm, null, prefix)
+        self.factors = FaceFactors(self._comm, NullModes(null), prefix)
         self._grams: Grams | None = None
         if self.count == 0:
             return

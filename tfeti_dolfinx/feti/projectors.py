@@ -9,10 +9,10 @@ from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import coo_array, csr_array, diags_array, eye_array
+from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
-from tfeti_dolfinx.common.arrays import TINY, Array, Entries
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, LocalMatrix
 from tfeti_dolfinx.common.parallel import any_rank, joined_over, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
@@ -122,11 +122,33 @@ def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
 SHIFTS = (0.0, 1e-14, 1e-13, 1e-12)
 
 
+class NullModes:
+    """Orthonormal columns that a semidefinite matrix makes nothing of, shape ``(r, k)``."""
+
+    def __init__(self, columns: csr_array) -> None:
+        self._columns = LocalMatrix(columns)
+        self._parts = [(rows, dense) for _, rows, dense in parts_of_columns(columns)]
+
+    def removed(self, x: Array) -> Array:
+        """x less its part in the null space, shape ``(r,)`` or ``(r, q)``."""
+        N = self._columns
+        return np.asarray(x - N @ N.transposed(x)) if self._parts else x
+
+    def pinned(self, scale: Array) -> Array:
+        """1 at entries that determine the modes, scaled by 1/``scale``; 0 at others."""
+        pinned = np.zeros(len(scale))
+        for rows, dense in self._parts:
+            modes = dense / scale[rows, None]
+            size = np.maximum(np.linalg.norm(modes, axis=0), TINY)
+            pinned[rows[independent(modes / size)]] = 1.0
+        return pinned
+
+
 class SemidefiniteFactor:
     """A⁺ of a sparse positive semidefinite A, the same on all ranks, on each of them. Collective.
 
     S A S + E Eᵀ with a unit diagonal of S A S, E unit vectors of entries that determine the null
-    modes, the orthonormal columns ``null``: an exact generalised inverse for right sides orthogonal
+    modes ``null``: an exact generalised inverse for right sides orthogonal
     to them. Where a pivot is lost a small shift takes its place, made good by three steps of
     refinement: each divides the error in a direction of eigenvalue σ by σ / shift.
 
@@ -137,12 +159,12 @@ class SemidefiniteFactor:
     def __init__(
         self,
         A: csr_array,
-        null: csr_array,
+        null: NullModes,
         comm: MPI.Intracomm,
         what: str,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.comm, self._null = comm, null if null.shape[1] else None
+        self.comm, self._null = comm, null
         self._scale, pinned = _scaling(A, null)
         scaled = _scaled(A, self._scale, pinned)
         self._factor: CholeskyFactor | None = None
@@ -168,40 +190,32 @@ class SemidefiniteFactor:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""
         if self._factor is None:
             return y
-        null = self._null
-        b = self._scale * (y if null is None else _without(null, y))
+        b = self._scale * self._null.removed(y)
         x = self._factor.solve(b)
         for _ in range(3 if self._shift else 0):
             x += self._factor.solve(b - self._A @ x)
-        return self._scale * x if null is None else _without(null, self._scale * x)
+        return self._null.removed(self._scale * x)
 
 
-def _scaling(A: csr_array, null: csr_array) -> tuple[Array, Array]:
+def _scaling(A: csr_array, null: NullModes) -> tuple[Array, Array]:
     """S of a unit diagonal of SAS; flags of entries that determine the null modes, or are 0."""
     diagonal = A.diagonal()
     scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
-    pinned = np.where(diagonal > 0.0, 0.0, 1.0)  # what nothing holds at all stands for itself
-    for _, rows, dense in parts_of_columns(null):
-        modes = dense / scale[rows, None]
-        size = np.maximum(np.linalg.norm(modes, axis=0), TINY)
-        pinned[rows[independent(modes / size)]] = 1.0
-    return scale, pinned
+    # what nothing holds at all stands for itself
+    return scale, np.where(diagonal > 0.0, null.pinned(scale), 1.0)
 
 
 def _scaled(A: csr_array, scale: Array, pinned: Array) -> Entries:
     """SAS + diag(pinned)."""
-    A.sort_indices()
-    values = A.data * np.repeat(scale, np.diff(A.indptr)) * scale[A.indices]
-    scaled = Entries(values, A.indices, A.indptr, A.shape)
-    if not np.any(pinned):
-        return scaled
-    made = csr_array(scaled.csr() + diags_array(pinned))
-    return Entries(made.data, made.indices, made.indptr, made.shape)
-
-
-def _without(null: csr_array, x: Array) -> Array:
-    """x less its part in the null space."""
-    return np.asarray(x - null @ (null.T @ x)) if null.shape[1] else x
+    A.sum_duplicates()
+    row = np.repeat(np.arange(len(scale)), np.diff(A.indptr))
+    values, stored = A.data * scale[row] * scale[A.indices], row == A.indices
+    values[stored] += pinned[row[stored]]
+    more = np.setdiff1d(np.flatnonzero(pinned), row[stored])
+    left = np.bincount(row[A.indices < row], minlength=len(scale))
+    at, before = (A.indptr[:-1] + left)[more], np.searchsorted(more, np.arange(len(A.indptr)))
+    indices = np.insert(A.indices, at, more)
+    return Entries(np.insert(values, at, pinned[more]), indices, A.indptr + before, A.shape)
 
 
 # --- Oblique projectors -----------------------------------------------------------------------
@@ -220,7 +234,7 @@ class ObliqueProjectors:
     """
 
     def __init__(
-        self, grams: Grams, face: Face, C: csr_array, null: csr_array, comm: MPI.Intracomm
+        self, grams: Grams, face: Face, C: csr_array, null: NullModes, comm: MPI.Intracomm
     ) -> None:
         self._comm, self._face, self._null, self._C = comm, face, null, C
         self._G, self._Gt = grams.G, grams.Gt
@@ -240,8 +254,8 @@ class ObliqueProjectors:
         """H⁺y without null modes, for y orthogonal to them; shape ``(r,)`` or ``(r, q)``."""
         if self._factor is None:
             return y
-        x = self._factor.solve((self._scale * _without(self._null, y).T).T)
-        return _without(self._null, (self._scale * x.T).T)
+        x = self._factor.solve((self._scale * self._null.removed(y).T).T)
+        return self._null.removed((self._scale * x.T).T)
 
     def coordinates(self, x: Array) -> Array:
         """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
@@ -265,7 +279,7 @@ class FaceFactors:
     """Factors of the Gram matrices of faces; ``count``: how many, of the whole and of faces."""
 
     comm: MPI.Intracomm
-    null: csr_array
+    null: NullModes
     prefix: str
     count: Counter[str] = field(default_factory=Counter)
 
