@@ -310,3 +310,25 @@ def test_an_update_that_raises_has_changed_nothing():
         assert counters(scene.problem.report) == [0] * len(COUNTERS)
     for item in (scene, other):
         item.problem.destroy()
+
+
+def test_coefficients_that_become_zero_leave_no_friction():
+    d = decomposed("quadrilateral", 4, 2)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    mu = fem.Function(fem.functionspace(d.mesh, ("DG", 0)))
+    a, load = ufl.inner(hooke()(u), strain(v)) * ufl.dx, ufl.as_vector((0.02, -0.07))
+    contact = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), friction=tfeti.Coulomb(mu))
+    problem = tfeti.ContactProblem(
+        a, ufl.dot(load, v) * ds(d.surface("top")), [clamp(V, d.facets("left"))], [contact], d
+    )
+    found = []
+    for value in (0.02, 0.0, 0.02):
+        mu.x.array[:] = value
+        problem.solve()
+        along, across = problem.solution.contact().resultant.force
+        found.append(abs(along) / across)
+    assert found[1] <= 1e-12
+    assert min(found[0], found[2]) > 1e-3
+    problem.destroy()
