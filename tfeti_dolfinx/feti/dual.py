@@ -252,10 +252,15 @@ class Dual:
                 f"are 0 or from {LIMITS.least:g} to {LIMITS.most:g}"
             )
 
-    def bound_friction(self, pressures: Array) -> None:
-        """Take λ_N of each of ``constraints.pressed`` to bound friction with; ∞ sticks."""
-        self.pressures[self._given.pressed] = pressures
-        self.constraints = self._given.with_pressures(pressures)
+    def bound_friction(self, pressures: Array | None) -> None:
+        """Take λ_N of each of ``constraints.pressed`` to bound friction with; ∞ sticks.
+
+        None: no rank has a pressed row.
+        """
+        self.constraints = self._given
+        if pressures is not None:
+            self.pressures[self._given.pressed] = pressures
+            self.constraints = self._given.with_pressures(pressures)
         self.feasible = self.law(self.constraints)
 
     def forget_counts(self) -> None:

@@ -114,7 +114,7 @@ def solve_with_friction(
         those of all), and how the bounds have come to rest.
     """
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
-        dual.bound_friction(np.zeros(0))  # there may have been coefficients
+        dual.bound_friction(None)  # there may have been coefficients
         return *solve_dual(dual, options, qp_type, start, monitor, goal), FixedPointStatus()
     least = options.number if goal is None else parameters.with_target * options.friction_rtol
     tolerance = min(options.friction_rtol, parameters.beside_rtol * least)
