@@ -88,7 +88,7 @@ class NewtonTolerances:
     flattest: float = 0.25
     nothing: float = 1e-12
     nowhere: float = 1e-13
-    final: float = 0.2
+    final: float = 0.5
     curvature: float = 0.5
     max_line_search: int = 12
     rounding: float = 1e-11
