@@ -110,7 +110,7 @@ def test_versions_of_the_readme_are_those_that_run():
 
 
 def test_the_sample_of_a_report_is_what_a_demo_prints(quick_demo, serial_only):
-    """Lines and words alike; whole numbers of the model and the contact equal."""
+    """Lines and words alike; whole numbers within 5 %, as each gmsh has its own mesh."""
     (sample,) = re.findall(r"^```text\n(.*?)^```", page("docs/report"), re.DOTALL | re.MULTILINE)
     said = sample.splitlines()
     printed = quick_demo("cylinder_on_block_2d").out.splitlines()
@@ -118,8 +118,9 @@ def test_the_sample_of_a_report_is_what_a_demo_prints(quick_demo, serial_only):
     printed = printed[start : start + len(said)]
     number = re.compile(r"-?\d[\d.]*(e[-+]\d+)?")
     for k in (1, 2):
-        cut = said[k].split(", pressure")[0].split(", force")[0]
-        assert printed[k].startswith(cut)
+        parts = [line[k].split(", pressure")[0].split(", force")[0] for line in (said, printed)]
+        whole = [[int(found) for found in re.findall(r"\b\d+\b", part)] for part in parts]
+        assert whole[0] == pytest.approx(whole[1], rel=0.05)
     for k in (1, 2, 3, 4):
         assert number.sub("#", said[k]) == number.sub("#", printed[k])
     assert printed[5].startswith("  time ")

@@ -9,7 +9,7 @@ from test_blocks import data, stiffness
 from test_dual import check_operator
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.common.arrays import parts_of
+from tfeti_dolfinx.common.arrays import LocalMatrix, parts_of
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
@@ -183,3 +183,12 @@ def test_false_friends_are_told_apart(cell, equals):
 
 def test_shared_blocks_keep_the_promises_of_a_block(equals):
     check_kind_of_block(lambda data: SparseBlock(data, equals=equals))
+
+
+@pytest.mark.parametrize("columns", [0, 1, 3])
+def test_products_with_any_number_of_columns(columns):
+    """Newer PETSc refuses products with none."""
+    A = csr_array(np.arange(6.0).reshape(2, 3))
+    x, y = np.ones((3, columns)), np.ones((2, columns))
+    assert np.array_equal(LocalMatrix(A) @ x, A @ x)
+    assert np.array_equal(LocalMatrix(A).transposed(y), A.T @ y)

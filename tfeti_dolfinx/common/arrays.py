@@ -120,7 +120,7 @@ class LocalMatrix:
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
         if x.ndim > 1:
-            return of_columns(self._petsc.matMult, x)
+            return of_columns(self._petsc.matMult, x, self.shape[0])
         self._x.setArray(x)
         self._petsc.mult(self._x, self._y)
         return np.array(self._y.array_r)
@@ -128,7 +128,7 @@ class LocalMatrix:
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""
         if y.ndim > 1:
-            return of_columns(self._petsc.transposeMatMult, y)
+            return of_columns(self._petsc.transposeMatMult, y, self.shape[1])
         self._y.setArray(y)
         self._petsc.multTranspose(self._y, self._x)
         return np.array(self._x.array_r)
@@ -139,8 +139,10 @@ class LocalMatrix:
         return Entries(data, indices, indptr, self.shape)
 
 
-def of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array) -> Array:
-    """Return a product of PETSc with columns."""
+def of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array, rows: int) -> Array:
+    """Return a product of PETSc with columns, maybe none, shape ``(rows, q)``."""
+    if not x.shape[1]:
+        return np.zeros((rows, 0))
     given = PETSc.Mat().createDense(x.shape, array=np.asfortranarray(x), comm=PETSc.COMM_SELF)
     made = product(given)
     found = np.array(made.getDenseArray(readonly=True), order="F")

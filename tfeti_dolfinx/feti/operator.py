@@ -87,7 +87,7 @@ class PreconditionerChoice:
         volume: (λ + 2μ)/μ, 20 of ν = 0.474, from which on what is inside has to follow a trace.
     """
 
-    dear: float = 190.0
+    dear: float = 200.0
     steps: int = 60
     volume: float = 20.0
 

@@ -90,7 +90,7 @@ class CholeskyFactor:
         if b.size == 0:
             return np.array(b)
         if b.ndim == 2:
-            return of_columns(self._solved, b)
+            return of_columns(self._solved, b, len(b))
         self._b.array[:] = b
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
