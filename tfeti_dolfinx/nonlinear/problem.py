@@ -194,8 +194,9 @@ class NonlinearContactProblem(ContactProblem):
             checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")
             given["tolerances"] = asdict(tolerances)
         self._tolerances = tolerances
-        self._forcing = tolerances.forcing or (0.3 if finite else 1.5)
-        self._loosest = tolerances.loosest or (0.01 if finite else 0.1)
+        forcing, loosest = (0.3, 0.01) if finite else (1.5, 0.1)
+        self._forcing = forcing if tolerances.forcing is None else tolerances.forcing
+        self._loosest = loosest if tolerances.loosest is None else tolerances.loosest
         self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)

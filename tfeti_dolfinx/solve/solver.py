@@ -134,8 +134,8 @@ def solve_dual(
         monitor=monitor or no_monitor,
     )
     rounding = result.reason == ConvergedReason.DIVERGED_ROUNDING
-    if rounding and dual.late is not None and dual.late.steps:
-        dual.late.steps = 0  # K_bb of thin parts spans more digits than S: begin again
+    if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
+        late.steps = 0  # K_bb of thin parts spans more digits than S: begin again
         return solve_dual(dual, options, qp_type, start, monitor, goal, rtol)
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
     if (state := rule.recovered) is not None:
