@@ -52,7 +52,8 @@ from tfeti_dolfinx.mesh.gmsh_reading import read_gmsh
 from tfeti_dolfinx.nonlinear.finite_plasticity import FiniteJ2Plasticity
 from tfeti_dolfinx.nonlinear.hyperelasticity import NeoHooke, SaintVenantKirchhoff
 from tfeti_dolfinx.nonlinear.materials import J2Plasticity
-from tfeti_dolfinx.nonlinear.problem import NewtonTolerances, NonlinearContactProblem
+from tfeti_dolfinx.nonlinear.newton import NewtonTolerances
+from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.output import write_pvd, write_vtx, write_xdmf
 from tfeti_dolfinx.plot import plot_deformed, plot_friction, plot_pressure

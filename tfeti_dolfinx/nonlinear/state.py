@@ -110,6 +110,30 @@ class InternalVariables:
         self.set(found)
 
 
+def check_state(update: Any, state: Any) -> None:
+    """Raise if of a material either ``update`` or ``state`` is given, and not the other.
+
+    Raises:
+        InputError: It names the material and its variables.
+    """
+    if update is None and isinstance(state, LawVariables):
+        name = type(state.law).__name__
+        raise InputError(
+            f"state is that of a {name}, whose stresses would never be returned to the yield "
+            "surface; expected update=, its method"
+        )
+    law = getattr(update, "__self__", None)
+    variables = getattr(law, "state", None)
+    if not isinstance(variables, Mapping):
+        return
+    left = [f.name for f in variables if not any(f is g for g in (state or {}))]
+    if left:
+        raise InputError(
+            f"update is a method of {type(law).__name__}, whose internal variables "
+            f"{', '.join(left)} would never be committed; expected state=, its attribute"
+        )
+
+
 def _of_cells(function: fem.Function) -> Array:
     """Return the values of a function whose unknowns belong to one cell each, ``(cells, w)``."""
     dofmap = function.function_space.dofmap

@@ -1,0 +1,164 @@
+"""Newton's method with the contact inside: tolerances, how long a model is kept, acceleration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+
+
+@dataclass(frozen=True)
+class NewtonTolerances:
+    """Tolerances of Newton's method with the contact inside.
+
+    Attributes:
+        max_it: Most linearised problems in a load step.
+        safety: What the next increment is expected to be is multiplied with, before it is compared
+            with the tolerance.
+        forcing: Share of the expected increment to which a linearised problem is solved (the
+            forcing term of Eisenstat and Walker); None: 1.5, in finite strain 0.3, where a rough
+            displacement opens contacts that the next step has to close again, and makes tangents
+            and places anew.
+        loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
+            0.01.
+        steepest, flattest: In small strain forcing expects the next increment to be between these
+            shares of the last one: the slope along one step does not see all that is left, and at
+            that of a kept tangent a new one would be solved to more than it moves.
+        nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
+            that are let go.
+        nowhere: Of the length of the scene, in finite strain: less is rounding of where bodies are.
+        final: Share of ``rtol`` to which the last linearised problems are solved at least, so that
+            increments can fall below ``rtol``.
+        curvature: A step is shortened where the residual along it, contact forces included, has
+            at its end more than this share of its value at its begin, with the other sign.
+        max_line_search: Most residuals that a line search assembles.
+        rounding: Share of dᵀD d, D the diagonal of J, that is rounding of dᵀJ d: a rigid step has
+            no energy.
+        shortest: Length at which a step that turns cells inside out is given up.
+        keeping: In small strain a tangent is kept, with its factors, where the last remainder was
+            at most this: its directions of conjugate gradients then serve the next problems, too.
+        settled: And where the increment was at most this share of the load step's first one.
+        frozen: In finite strain tangent and places are kept until the increment is at most this
+            share of the first one that they gave.
+        most_frozen: For so many linearised problems at most.
+        turning: Where the first increment with new places is more than this share of that with the
+            last ones, contact changes more by where bodies are than by their stresses: from then on
+            places are new for each linearised problem.
+        anderson: Iterates that Anderson's acceleration combines.
+        dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
+            are taken for 0.
+        slow: A kept model is made anew where an increment is more than this share of the last one.
+        difference: Length of the step, of the displacement, of the difference quotient that a
+            given J is compared with where Newton's method has failed.
+        another: Of J along a step: a difference beyond it is that of another tangent.
+        turned: Angle by which a body is turned to see whether F is one of finite strain.
+        alike: Of the residual of a stretch: residuals nearer to each other are the same.
+        other: Anderson's acceleration begins anew where an increment is so many times the last
+            one, as with rows of new places.
+    """
+
+    max_it: int = 50
+    safety: float = 10.0
+    forcing: float | None = None
+    loosest: float | None = None
+    steepest: float = 0.1
+    flattest: float = 0.25
+    nothing: float = 1e-12
+    nowhere: float = 1e-13
+    final: float = 0.5
+    curvature: float = 0.5
+    max_line_search: int = 12
+    rounding: float = 1e-11
+    shortest: float = 0.01
+    keeping: float = 0.5
+    settled: float = 0.05
+    frozen: float = 0.1
+    most_frozen: int = 4
+    turning: float = 0.03
+    anderson: int = 5
+    dependent: float = 1e-12
+    slow: float = 0.7
+    difference: float = 1e-6
+    another: float = 0.3
+    turned: float = 0.1
+    alike: float = 1e-6
+    other: float = 2.0
+
+
+class ModelKeeping:
+    """Decides whether the next linearised problem has the model of the last one.
+
+    That is J with its factors, and in finite strain the rows of the same places, too.
+
+    Args:
+        tolerances: Those of Newton's method.
+        finite: Whether strains are finite.
+
+    Attributes:
+        kept: Whether the present model is that of the linearised problem before.
+        before: Size of the last increment.
+    """
+
+    def __init__(self, tolerances: NewtonTolerances, finite: bool) -> None:
+        self._tolerances, self._finite, self._freezes = tolerances, finite, True
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a load step with a new model."""
+        self.kept, self.before, self._first, self._of_model, self._uses = False, 0.0, 0.0, 0.0, 0
+
+    def is_slow(self, size: float) -> bool:
+        """Return whether an increment of a kept model is hardly less than the last one."""
+        return self.kept and size > self._tolerances.slow * self.before
+
+    def next(self, size: float, t: float, remainder: float) -> bool:
+        """Return whether to keep the model after an increment, its length t and remainder."""
+        tol, slow = self._tolerances, self.is_slow(size)
+        self._first = self._first or size
+        if not self.kept:
+            turns = self._of_model > 0.0 and size > tol.turning * self._of_model
+            self._freezes = self._freezes and not turns
+            self._of_model, self._uses = size, 0
+        self._uses += 1
+        if self._finite:
+            wanted = self._uses == 1 or size > tol.frozen * self._of_model
+            good = self._freezes and wanted and self._uses <= tol.most_frozen
+        else:
+            good = remainder <= tol.keeping and size <= tol.settled * self._first
+        self.kept, self.before = good and t == 1.0 and not slow, size
+        return self.kept
+
+
+class Anderson:
+    """Anderson's acceleration of u ← u + d: the last differences of d in least squares.
+
+    Args:
+        tolerances: Those of Newton's method.
+        comm: Communicator.
+    """
+
+    def __init__(self, tolerances: NewtonTolerances, comm: MPI.Intracomm) -> None:
+        self._depth, self._rcond, self._comm = tolerances.anderson, tolerances.dependent, comm
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the iterates so far."""
+        self._steps: list[Array] = []
+        self._places: list[Array] = []
+
+    def next(self, u: Array, d: Array) -> Array:
+        """Return the next iterate after u, whose step is d. Collective."""
+        end = moved = u + d
+        if self._steps:
+            steps = d[:, None] - np.array(self._steps).T
+            gram = summed(self._comm, steps.T @ np.column_stack((steps, d)))
+            gram = bcast_from_root(self._comm, gram)
+            share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=self._rcond)[0]
+            moved = end - (u[:, None] - np.array(self._places).T + steps) @ share
+        self._steps = [*self._steps, d][-self._depth :]
+        self._places = [*self._places, u][-self._depth :]
+        return moved
