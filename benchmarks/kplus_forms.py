@@ -10,6 +10,7 @@ go to results/kplus_forms.md, .json and .png.
 from __future__ import annotations
 
 import sys
+from bisect import bisect_left
 
 import petsc4py
 
@@ -21,26 +22,82 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
+from petsc4py import PETSc
 from scipy.linalg import eigh
 from scipy.sparse import csr_array
 
 from benchmarks.tools import column, command_line, curves, finish, picture
+from tfeti_dolfinx.common.arrays import as_petsc_matrix
 from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.subdomains.block import candidate_modes, fixing_nodes, kernel_of
-from tfeti_dolfinx.subdomains.kplus import (
-    SchurPseudoinverse,
-    regular_matrix,
-    regularised,
-    trailing_pseudoinverse,
-)
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor
+from tfeti_dolfinx.subdomains.kplus import regular_matrix, regularised
+
+ASPECT, NU = 4, 0.3
+SOFTEST = 8  # deformations that K⁺ is to find
+
+
+class SchurPseudoinverse(CholeskyFactor):
+    """K⁺ = [K_rr⁻¹, 0; 0, 0] + E S⁺ Eᵀ, E = [−K_rr⁻¹K_rs; I], S = K_ss − K_sr K_rr⁻¹ K_rs.
+
+    s are the fixing unknowns, r the others (Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos,
+    IJNME 88, 2011). E S⁺ Eᵀ is kept as H Hᵀ, n rows and |s| − r columns.
+    """
+
+    def __init__(self, K, R, s, prefix="tfeti_sub_"):
+        self.s = s
+        # diag(K_rr, diag K_ss)
+        apart = K.tocoo()
+        in_s = np.isin(np.arange(K.shape[0]), s)
+        row, column = apart.coords
+        values = np.where((in_s[row] | in_s[column]) & (row != column), 0.0, apart.data)
+        self._H = np.zeros((K.shape[0], 0))
+        super().__init__(csr_array((values, (row, column)), shape=K.shape), prefix)
+        K_s = K[:, s].toarray()
+        K_rs = np.array(K_s)
+        K_rs[s] = 0.0
+        E = -super().solve(K_rs)
+        S = K_s[s] + K_rs.T @ E
+        E[s] += np.eye(len(s))
+        V = np.linalg.qr(R[s], mode="complete")[0][:, R.shape[1] :]
+        energies, vectors = np.linalg.eigh(V.T @ S @ V)
+        self._H = E @ V @ (vectors / np.sqrt(energies))
+
+    def solve(self, b):
+        """K⁺ b."""
+        b_r = np.array(b)
+        b_r[self.s] = 0.0
+        return super().solve(b_r) + self._H @ (self._H.T @ b)
+
+
+def trailing_pseudoinverse(K, R, fixing_dofs, prefix="tfeti_sub_", no_pivot=1e-4):
+    """With s what elimination leaves at its first zero pivot (Farhat, Géradin, IJNME 41, 1998).
+
+    Found by the kernel: the last unknowns of a nested dissection, as few as hold it. No motion is
+    less than ``no_pivot`` of its mean size on them, which would leave a pivot of 1e-8 before them.
+    """
+    matrix = as_petsc_matrix(K)
+    rows, columns = matrix.getOrdering(PETSc.Mat.OrderingType.ND)
+    last = np.array(rows.indices[::-1], dtype=np.int64)
+    for item in (rows, columns, matrix):
+        item.destroy()
+
+    def held(count):
+        """Least mean size of a motion of the kernel on the last unknowns, over that on all."""
+        some, every = (np.linalg.svd(X, compute_uv=False)[-1] for X in (R[last[:count]], R))
+        return some / every * np.sqrt(len(R) / count)
+
+    counts = range(R.shape[1], len(last) + 1)
+    return SchurPseudoinverse(
+        K, R, np.sort(last[: counts[bisect_left(counts, no_pivot, key=held)]])
+    )
+
 
 FORMS = {
     "regularized": regularised,
     "schur": SchurPseudoinverse,
     "lu_svd": trailing_pseudoinverse,
 }
-ASPECT, NU = 4, 0.3
-SOFTEST = 8  # deformations that K⁺ is to find
 
 
 class Beam:
@@ -136,7 +193,7 @@ def row(kind, choice, beam, nodes):
         entry |= {"condition of the factor": condition(regular_matrix(K, R, dofs).toarray())}
         entry |= {"condition of S": "-"}
     else:
-        S, K_rr = schur_complement(K.toarray(), pinv.unknowns)
+        S, K_rr = schur_complement(K.toarray(), pinv.s)
         entry |= {"unknowns": len(S), "condition of the factor": condition(K_rr)}
         entry |= {"condition of S": condition(S, R.shape[1])}
     entry |= errors_of(pinv, beam)

@@ -30,7 +30,6 @@ from tfeti_dolfinx.qp.newton import NewtonParameters
 from tfeti_dolfinx.qp.smalse import SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
 
 # --- Options ----------------------------------------------------------------------------------
@@ -90,13 +89,6 @@ class Options:
         "weights of the constraints: the diagonal of K, which suits graded meshes and jumps of "
         "stiffness, or one per torn copy",
         choices=("stiffness", "multiplicity"),
-    )
-    kplus_type: str = described(
-        "regularized",
-        "subdomains",
-        "generalised inverse of a subdomain: K made regular on fixing nodes, by the Schur "
-        "complement on these, or by that on the last unknowns of an elimination",
-        choices=tuple(KPLUS_TYPES),
     )
     local_type: str = described(
         "auto",

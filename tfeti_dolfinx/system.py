@@ -31,7 +31,7 @@ from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.solve.solver import resolved
 from tfeti_dolfinx.subdomains.block import Counters, RigidBlock, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory
+from tfeti_dolfinx.subdomains.kplus import InverseFactory, regularised
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import (
@@ -79,7 +79,7 @@ class Settings:
 
     def inverses(self, counters: Counters) -> InverseFactory:
         """Return the factory of the subdomains' generalised inverses."""
-        kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
+        kplus = self.extensions.kplus or regularised
         return InverseFactory(counters, kplus, f"{self.prefix}sub_")
 
     def make_subdomains(
