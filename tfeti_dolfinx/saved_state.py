@@ -146,65 +146,42 @@ KINDS = ("subdomains", "nodes", "cells", "rows", "conditions")
 
 @dataclass(frozen=True)
 class SavedState:
-    """An accepted solution on this rank, and what the next solve starts from.
+    """An accepted solution on this rank, and what the next solve starts from."""
 
-    Attributes:
-        subdomains: Labels of this rank's subdomains.
-        layout: Checksums of their cells and points in the mesh before it was torn.
-        nodes: Labels of primal nodes.
-        cells: Labels of cells, where there are internal variables; else empty.
-        rows: Labels of rows.
-        conditions: Labels of conditions.
-        u: Displacement in primal order.
-        lam: Multipliers λ of this rank's rows.
-        mu: Multipliers of Gλ = e; empty where they are not known.
-        norm: Estimate of ‖F‖ that solves have come to, shape ``()``.
-        status: Status of each row, see ``qp.sets.Status``.
-        slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
-        reach: How far was searched in each contact.
-        secondary: Tag of the surface of each contact that has its conditions.
-        contact: Contact of each condition.
-        group: Label of the node of each condition.
-        reached: Whether a condition is within reach.
-        velocity: Velocity in primal order, empty without inertia.
-        load: Load likewise.
-        predicted: Multipliers of this rank's rows of the predictor, empty without one.
-        size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
-        directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
-        internal: Internal variables of a nonlinear problem in each cell, ``(cells, w)``; else
-            empty.
-        tools: Motions of rigid bodies, one after the other.
-        image: Fλ; empty where it is not known.
-        predicted_image: The same of the predictor.
-        weights: D of a nonlinear problem, which rows are scaled with, in primal order; else empty.
-    """
-
-    subdomains: Array
-    layout: Array
-    nodes: Array
-    rows: Array
-    conditions: Array
-    u: Array
-    lam: Array
-    mu: Array
-    norm: Array
-    status: Array
-    slip: Array
-    reach: Array
-    secondary: Array
-    contact: Array
-    group: Array
-    reached: Array
+    subdomains: Array  # labels of this rank's subdomains
+    layout: Array  # checksums of their cells and points in the mesh before it was torn
+    nodes: Array  # labels of primal nodes
+    rows: Array  # labels of rows
+    conditions: Array  # labels of conditions
+    u: Array  # displacement in primal order
+    lam: Array  # multipliers λ of this rank's rows
+    mu: Array  # multipliers of Gλ = e; empty where they are not known
+    norm: Array  # estimate of ‖F‖ that solves have come to, shape ()
+    status: Array  # status of each row, see `qp.sets.Status`
+    slip: Array  # where the load step began: tangential v_i of the conditions, (n, gdim - 1)
+    reach: Array  # how far was searched in each contact
+    secondary: Array  # tag of the surface of each contact that has its conditions
+    contact: Array  # contact of each condition
+    group: Array  # label of the node of each condition
+    reached: Array  # whether a condition is within reach
+    # labels of cells, where there are internal variables; else empty
     cells: Array = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    # velocity in primal order, empty without inertia
     velocity: Array = field(default_factory=lambda: np.zeros(0))
-    load: Array = field(default_factory=lambda: np.zeros(0))
+    load: Array = field(default_factory=lambda: np.zeros(0))  # load likewise
+    # multipliers of this rank's rows of the predictor, empty without one
     predicted: Array = field(default_factory=lambda: np.zeros(0))
+    # that of the step which the matrix was made for, shape (); 0 without inertia
     size: Array = field(default_factory=lambda: np.zeros(()))
+    # what `Recycled` keeps of earlier solves, shape (2, m, k)
     directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    # internal variables of a nonlinear problem in each cell, (cells, w); else empty
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # motions of rigid bodies, one after the other
     tools: Array = field(default_factory=lambda: np.zeros(0))
-    image: Array = field(default_factory=lambda: np.zeros(0))
-    predicted_image: Array = field(default_factory=lambda: np.zeros(0))
+    image: Array = field(default_factory=lambda: np.zeros(0))  # Fλ; empty where it is not known
+    predicted_image: Array = field(default_factory=lambda: np.zeros(0))  # the same of the predictor
+    # D of a nonlinear problem, which rows are scaled with, in primal order; else empty
     weights: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod

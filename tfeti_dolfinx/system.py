@@ -48,19 +48,12 @@ from tfeti_dolfinx.subdomains.subdomains import (
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a solve, and what they make.
+    """Settings of a solve, and what they make."""
 
-    Attributes:
-        options: Options.
-        prefix: Prefix of all options.
-        factor_options: Options that PETSc's factors read, without prefix.
-        extensions: Parts that the program brings.
-    """
-
-    options: Options
-    prefix: str
-    factor_options: Mapping[str, Any]
-    extensions: Extensions
+    options: Options  # options
+    prefix: str  # prefix of all options
+    factor_options: Mapping[str, Any]  # options that PETSc's factors read, without prefix
+    extensions: Extensions  # parts that the program brings
 
     @property
     def given(self) -> dict[str, Any]:

@@ -26,25 +26,19 @@ from tfeti_dolfinx.subdomains.kplus import MakeInverse
 
 @dataclass(frozen=True)
 class CheckTolerances:
-    """Steps and tolerances of the checks.
+    """Steps and tolerances of the checks."""
 
-    Attributes:
-        short: Step along a face, relative to the radius of its curvature, so short that what is
-            linear in it stands out from what is quadratic.
-        long: A longer one, so that what is quadratic stands out from rounding.
-        shorter: Steps along a gradient: small sets are curved so much that only the last ones are
-            short.
-        zero: Eigenvalues of a stiffness, over the largest, that are 0 but for rounding (which is
-            1e-16 times a few powers of n).
-        rank: Singular values, their roots, likewise.
-        lost: Of eps times the condition: what a solve may lose, with room for sums of many terms.
-    """
-
+    # step along a face, relative to the radius of its curvature, so short that what is linear in it
+    # stands out from what is quadratic
     short: float = 1e-8
-    long: float = 1e-5
+    long: float = 1e-5  # a longer one, so that what is quadratic stands out from rounding
+    # steps along a gradient: small sets are curved so much that only the last ones are short
     shorter: tuple[float, ...] = (1e-8, 1e-10, 1e-12, 1e-14)
+    # eigenvalues of a stiffness, over the largest, that are 0 but for rounding (which is 1e-16
+    # times a few powers of n)
     zero: float = 1e-12
-    rank: float = 1e-10
+    rank: float = 1e-10  # singular values, their roots, likewise
+    # of eps times the condition: what a solve may lose, with room for sums of many terms
     lost: float = 100.0
 
 

@@ -96,30 +96,24 @@ ESTIMATES = "estimates"  # how the sentence on them begins
 
 @dataclass(frozen=True)
 class WarningLimits:
-    """Limits from which on the report warns.
+    """Limits from which on the report warns."""
 
-    Attributes:
-        rounding: Errors of beams and strips that are 10⁴ times as long as thick, over the estimate
-            of rounding: 10 to 50 were seen.
-        flat: ‖J‖‖J⁻¹‖/gdim of a cell that is about 1000 times as long as thick.
-        locks: (λ + 2μ)/μ, 51 of ν = 0.49: from here on linear displacements are too stiff.
-        turns: Radians; what linear kinematics takes for strain is half the square, 0.5 %.
-        facets: Of what the largest pressure presses together: gaps that straight facets change by
-            as much had forces and pressures wrong by 4 to 10 %.
-        hardly_covered: Share of a node's surface that the other side of a pair covers: pressures
-            of nodes with less were 5 to 40 000 times those beside them, of blocks on flat faces.
-        stands_out: Such a pressure over the largest of other nodes; at edges they differ by less.
-        listed: Bodies that a sentence names.
-    """
-
+    # errors of beams and strips that are 10⁴ times as long as thick, over the estimate of rounding:
+    # 10 to 50 were seen
     rounding: float = 30.0
-    flat: float = 500.0
+    flat: float = 500.0  # ‖J‖‖J⁻¹‖/gdim of a cell that is about 1000 times as long as thick
+    # (λ + 2μ)/μ, 51 of ν = 0.49: from here on linear displacements are too stiff
     locks: float = 50.0
-    turns: float = 0.1
+    turns: float = 0.1  # radians; what linear kinematics takes for strain is half the square, 0.5 %
+    # of what the largest pressure presses together: gaps that straight facets change by as much had
+    # forces and pressures wrong by 4 to 10 %
     facets: float = 0.5
+    # share of a node's surface that the other side of a pair covers: pressures of nodes with less
+    # were 5 to 40 000 times those beside them, of blocks on flat faces
     hardly_covered: float = 0.02
+    # such a pressure over the largest of other nodes; at edges they differ by less
     stands_out: float = 2.0
-    listed: int = 3
+    listed: int = 3  # bodies that a sentence names
 
 
 LIMITS = WarningLimits()

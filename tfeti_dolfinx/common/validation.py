@@ -146,27 +146,16 @@ ABOVE_0 = Range("more than 0", lambda value: value > 0.0)
 
 @dataclass(frozen=True)
 class Description:
-    """Description of a parameter.
+    """Description of a parameter."""
 
-    Attributes:
-        algorithm: Whose it is.
-        text: What it does.
-        choices: Its values, if they are few.
-        fits: Range of a number.
-        words: What may stand in the place of a number.
-        name: Name on the command line, if it is not the field's.
-        symbol: Letter in the literature and in docs/notation.md.
-        kind: Type of its values, if it is not the default's.
-    """
-
-    algorithm: str
-    text: str
-    choices: tuple[str, ...] = ()
-    fits: Range = FINITE
-    words: tuple[str, ...] = ()
-    name: str = ""
-    symbol: str = ""
-    kind: type | None = None
+    algorithm: str  # whose it is
+    text: str  # what it does
+    choices: tuple[str, ...] = ()  # its values, if they are few
+    fits: Range = FINITE  # range of a number
+    words: tuple[str, ...] = ()  # what may stand in the place of a number
+    name: str = ""  # name on the command line, if it is not the field's
+    symbol: str = ""  # letter in the literature and in docs/notation.md
+    kind: type | None = None  # type of its values, if it is not the default's
 
 
 def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:
@@ -179,19 +168,12 @@ def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A described field, found in a dataclass or in one that is part of it.
+    """A described field, found in a dataclass or in one that is part of it."""
 
-    Attributes:
-        name: Name on the command line.
-        default: Its default.
-        description: What it is.
-        path: Names of the attributes that lead to it.
-    """
-
-    name: str
-    default: Any
-    description: Description
-    path: tuple[str, ...]
+    name: str  # name on the command line
+    default: Any  # its default
+    description: Description  # what it is
+    path: tuple[str, ...]  # names of the attributes that lead to it
 
     def value_in(self, parameters: Any) -> Any:
         """Its value in an object of the dataclass."""

@@ -112,18 +112,13 @@ class RowBuilder:
 
 @dataclass(frozen=True)
 class ContactRows:
-    """Origin of the rows B_N.
+    """Origin of the rows B_N."""
 
-    Attributes:
-        condition: Condition (of the records) of each row, shape ``(n,)``.
-        scale: The s_i that a condition was multiplied by, shape ``(n,)``: one number for all rows
-            of a condition, that which gives its normal row unit norm. Its force is s_i λ_i.
-        decided: Conditions of this rank that prescribed components decide alone, without rows.
-    """
-
-    condition: Array
+    condition: Array  # condition (of the records) of each row, shape (n,)
+    # the s_i that a condition was multiplied by, shape (n,): one number for all rows of a
+    # condition, that which gives its normal row unit norm. Its force is s_i λ_i
     scale: Array
-    decided: Array
+    decided: Array  # conditions of this rank that prescribed components decide alone, without rows
 
 
 def contact_rows(builder: RowBuilder) -> tuple[Rows, ContactRows]:
@@ -141,22 +136,17 @@ def contact_rows(builder: RowBuilder) -> tuple[Rows, ContactRows]:
 
 @dataclass(frozen=True)
 class TangentRows:
-    """Origin of the rows T.
+    """Origin of the rows T."""
 
-    Attributes:
-        condition: Condition of each point of ``RowSets.tangents``, shape ``(t,)``.
-        scale: The s_i of the normal row of the same condition, shape ``(t,)``; where prescribed
-            components leave none, one that gives the longer tangential row unit norm.
-        moves: Whether prescribed components leave enough of a row
-            (``RowTolerances.little_left``); rows without entries stay, so that a disc stays a
-            disc, shape ``(t, gdim - 1)``.
-        normal: Under Coulomb's law the normal row of the same condition, as a position in
-            ``RowSets.normals``, else −1, shape ``(t,)``.
-    """
-
-    condition: Array
+    condition: Array  # condition of each point of `RowSets.tangents`, shape (t,)
+    # the s_i of the normal row of the same condition, shape (t,); where prescribed components leave
+    # none, one that gives the longer tangential row unit norm
     scale: Array
+    # whether prescribed components leave enough of a row (`RowTolerances.little_left`); rows
+    # without entries stay, so that a disc stays a disc, shape (t, gdim - 1)
     moves: Array
+    # under Coulomb's law the normal row of the same condition, as a position in `RowSets.normals`,
+    # else −1, shape (t,)
     normal: Array
 
     def limits(self, traction: Array, area: Array) -> Array:

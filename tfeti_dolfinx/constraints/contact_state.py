@@ -134,15 +134,10 @@ class ToolState:
 
 @dataclass(frozen=True)
 class Multipliers:
-    """Multipliers of this rank's rows.
+    """Multipliers of this rank's rows."""
 
-    Attributes:
-        lam: λ, shape ``(m,)``.
-        face: Which of them carry a force, and which slip.
-    """
-
-    lam: Array
-    face: Face
+    lam: Array  # λ, shape (m,)
+    face: Face  # which of them carry a force, and which slip
 
 
 class ContactState:

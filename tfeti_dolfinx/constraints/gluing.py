@@ -39,17 +39,11 @@ from tfeti_dolfinx.mesh.untorn import cell_facets
 
 @dataclass(frozen=True)
 class HeldRows:
-    """The equality rows that hold prescribed components; the others have right sides 0.
+    """The equality rows that hold prescribed components; the others have right sides 0."""
 
-    Attributes:
-        row: Place of each among the equality rows, shape ``(h,)``.
-        component: Component that it holds, unrolled over the owned groups, shape ``(h,)``.
-        factor: What the component is multiplied by, shape ``(h,)``.
-    """
-
-    row: Array
-    component: Array
-    factor: Array
+    row: Array  # place of each among the equality rows, shape (h,)
+    component: Array  # component that it holds, unrolled over the owned groups, shape (h,)
+    factor: Array  # what the component is multiplied by, shape (h,)
 
 
 def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, HeldRows]:
@@ -112,15 +106,10 @@ def _orthonormal(weights: Array) -> Array:
 
 @dataclass(frozen=True)
 class Prescribed:
-    """Components that Dirichlet conditions prescribe, for the owned groups.
+    """Components that Dirichlet conditions prescribe, for the owned groups."""
 
-    Attributes:
-        flag: Whether a component is prescribed, shape ``(g, bs)``.
-        value: Its value, 0 where it is not, shape ``(g, bs)``.
-    """
-
-    flag: Array
-    value: Array
+    flag: Array  # whether a component is prescribed, shape (g, bs)
+    value: Array  # its value, 0 where it is not, shape (g, bs)
 
 
 def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
@@ -284,28 +273,18 @@ class Gluing:
 
     B depends on which components are prescribed, on the records' normals and weights, on which
     of them are within reach, and on D. Prescribed values and gaps are in c alone.
-
-    Attributes:
-        dofs: Dof maps.
-        prescribed: Dirichlet values.
-        records: Contact conditions of this rank.
-        held: The rows that hold prescribed components.
-        contact: Origin of the normal rows.
-        tangents: Origin of the tangential rows.
-        constraints: B, c and the sets of rows.
-        length: A length of the scene.
-        slip: Where the load step begins: the tangential v_i of all conditions then, shape
-            ``(n, gdim - 1)``. Friction acts on what comes to it.
     """
 
-    dofs: TornDofs
-    prescribed: Prescribed
-    records: ContactRecords
-    held: HeldRows
-    contact: ContactRows
-    tangents: TangentRows
-    constraints: Constraints
-    length: float
+    dofs: TornDofs  # dof maps
+    prescribed: Prescribed  # Dirichlet values
+    records: ContactRecords  # contact conditions of this rank
+    held: HeldRows  # the rows that hold prescribed components
+    contact: ContactRows  # origin of the normal rows
+    tangents: TangentRows  # origin of the tangential rows
+    constraints: Constraints  # B, c and the sets of rows
+    length: float  # a length of the scene
+    # where the load step begins: the tangential v_i of all conditions then, shape (n, gdim - 1).
+    # Friction acts on what comes to it
     slip: Array
 
     def right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Array:

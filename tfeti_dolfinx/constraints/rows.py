@@ -16,23 +16,18 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 
 @dataclass(frozen=True)
 class RowTolerances:
-    """Tolerances of rows.
+    """Tolerances of rows."""
 
-    Attributes:
-        agreement: Values that conditions prescribe at a node differ by less, relative to all.
-        nothing_left: Of a row's norm: if prescribed components leave less, rounding of the normal
-            has made it (ε|x|/h of a facet of size h at x), and the row is dropped.
-        little_left: Of Σ_j |a_ij| of a tangential row: if prescribed components leave less, it is
-            dropped. On a plane of symmetry, where nothing slips across, neighbours that do not
-            match leave a rest that hardly moves but would take friction; a body that is free
-            leaves a half.
-        overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
-            leave.
-    """
-
+    # values that conditions prescribe at a node differ by less, relative to all
     agreement: float = 1e-10
+    # of a row's norm: if prescribed components leave less, rounding of the normal has made it
+    # (ε|x|/h of a facet of size h at x), and the row is dropped
     nothing_left: float = 1e-6
+    # of Σ_j |a_ij| of a tangential row: if prescribed components leave less, it is dropped. On a
+    # plane of symmetry, where nothing slips across, neighbours that do not match leave a rest that
+    # hardly moves but would take friction; a body that is free leaves a half
     little_left: float = 0.25
+    # overlap, over the scene's length, that rounding of gaps and prescribed values may leave
     overlap: float = 1e-10
 
 
@@ -43,19 +38,12 @@ TOLERANCES = RowTolerances()
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one kind that this rank owns, in coordinate form.
+    """Rows of one kind that this rank owns, in coordinate form."""
 
-    Attributes:
-        group: Owned group that each row belongs to, shape ``(n,)``.
-        row: Row of each entry, shape ``(k,)``.
-        column: Global primal unknown of each entry, shape ``(k,)``.
-        value: The entries, shape ``(k,)``.
-    """
-
-    group: Array
-    row: Array
-    column: Array
-    value: Array
+    group: Array  # owned group that each row belongs to, shape (n,)
+    row: Array  # row of each entry, shape (k,)
+    column: Array  # global primal unknown of each entry, shape (k,)
+    value: Array  # the entries, shape (k,)
 
     def __len__(self) -> int:
         return len(self.group)
@@ -82,17 +70,11 @@ def stack(tables: list[Rows]) -> Rows:
 
 @dataclass(frozen=True)
 class RowSets:
-    """Local rows of B by name: nobody else knows in which order they stand.
+    """Local rows of B by name: nobody else knows in which order they stand."""
 
-    Attributes:
-        equalities: Gluing rows, and rows that hold prescribed components, shape ``(e,)``.
-        normals: Rows of contact conditions along their normals, λ ≥ 0, shape ``(n,)``.
-        tangents: Rows along the tangents of conditions with friction, shape ``(t, gdim - 1)``.
-    """
-
-    equalities: Array
-    normals: Array
-    tangents: Array
+    equalities: Array  # gluing rows, and rows that hold prescribed components, shape (e,)
+    normals: Array  # rows of contact conditions along their normals, λ ≥ 0, shape (n,)
+    tangents: Array  # rows along the tangents of conditions with friction, shape (t, gdim - 1)
 
     @property
     def contact(self) -> Array:
@@ -134,34 +116,25 @@ class Constraints:
 
     B acts on *trace* unknowns only: primal unknowns that some row touches, sorted as the primal
     ones. It depends neither on prescribed values nor on gaps; c does, and can be filled again.
-
-    Attributes:
-        B: Dual rows × trace unknowns, MPIAIJ.
-        c: Right sides of this rank's rows; 0 until they are set.
-        sets: Which local rows are what.
-        trace: Local primal unknown of each local trace unknown, ascending.
-        weights: D on the local trace unknowns: the rows are scaled with it. Of rigid bodies it is
-            infinite, and D⁻¹, which is what anything is made with, 0.
-        scale: The s_i of the conditions with rows, one for each of ``sets.normals``: over it what
-            a row misses is a length.
-        tangent_scale: The same for each point of ``sets.tangents``, shape ``(t,)``.
-        limits: The ψ_i, semi-axes of the sets of the tangential multipliers, shape
-            ``(t, gdim - 1)``; 0 until they are set.
-        pressed_by: Under Coulomb's law the local row of the condition's normal, else −1, shape
-            ``(t,)``.
-        coefficients: The μ_i of Coulomb's law, else 0, shape ``(t, gdim - 1)``.
     """
 
-    B: PETSc.Mat
-    c: Array
-    sets: RowSets
-    trace: Array
+    B: PETSc.Mat  # dual rows × trace unknowns, MPIAIJ
+    c: Array  # right sides of this rank's rows; 0 until they are set
+    sets: RowSets  # which local rows are what
+    trace: Array  # local primal unknown of each local trace unknown, ascending
+    # D on the local trace unknowns: the rows are scaled with it. Of rigid bodies it is infinite,
+    # and D⁻¹, which is what anything is made with, 0
     weights: Array
+    # the s_i of the conditions with rows, one for each of `sets.normals`: over it what a row misses
+    # is a length
     scale: Array
-    tangent_scale: Array
+    tangent_scale: Array  # the same for each point of `sets.tangents`, shape (t,)
+    # the ψ_i, semi-axes of the sets of the tangential multipliers, shape (t, gdim - 1); 0 until
+    # they are set
     limits: Array
+    # under Coulomb's law the local row of the condition's normal, else −1, shape (t,)
     pressed_by: Array
-    coefficients: Array
+    coefficients: Array  # the μ_i of Coulomb's law, else 0, shape (t, gdim - 1)
 
     @property
     def num_rows(self) -> int:

@@ -41,49 +41,34 @@ class ContactRecords:
     With the *relative displacement* v_i = Σ_j w_ij u_j − m_i of a node against what it meets, m_i
     the motion of a rigid body, the condition is n_i · v_i ≤ g_i, and its slip is the tangential
     part of v_i. A scalar space has frames of shape ``(n, 1, 1)``.
-
-    Attributes:
-        contact: Index of the contact (in the list that the user gave), shape ``(n,)``.
-        group: Owned group of the contact node, shape ``(n,)``.
-        frame: Right-handed orthonormal axes, shape ``(n, gdim, gdim)``: axis 0 is the normal n_i,
-            in which the node may not go further, the others are tangents.
-        gap: Distance g_i, a length, shape ``(n,)``.
-        geometric_gap: The distance that the geometry has, whatever a user gives, shape ``(n,)``.
-        curved_gap: The distance between the smooth surfaces that the facets of both sides stand
-            for, shape ``(n,)``.
-        conforms: Whether the facets change the gap by more than that of the smooth surfaces varies
-            from node to node, shape ``(n,)``.
-        area: Integral ∫φ_i of the node's hat over the contact surface, of a pair over what the
-            other side covers of it, shape ``(n,)``.
-        covered: The share of that integral over the whole surface, 1 at an obstacle, ``(n,)``.
-        within_reach: Whether a row is made at once; a condition out of reach gets one only if
-            the solution violates it, shape ``(n,)``.
-        condition: Condition of each weight, shape ``(k,)``.
-        entry_group: Global group of each weight, shape ``(k,)``.
-        weight: The w_ij, without a unit, shape ``(k,)``.
-        friction: ``Friction`` of each condition, shape ``(n,)``.
-        place: Σ_j w_ij x_j, where a rigid body that moves meets it, else 0, shape ``(n, gdim)``.
-        motion: Displacement of that body there, as far as it is known, shape ``(n, gdim)``.
-        candidates: Nodes of the contact surface whose groups this rank owns.
     """
 
-    contact: Array
-    group: Array
+    contact: Array  # index of the contact (in the list that the user gave), shape (n,)
+    group: Array  # owned group of the contact node, shape (n,)
+    # right-handed orthonormal axes, shape (n, gdim, gdim): axis 0 is the normal n_i, in which the
+    # node may not go further, the others are tangents
     frame: Array
-    gap: Array
-    geometric_gap: Array
+    gap: Array  # distance g_i, a length, shape (n,)
+    geometric_gap: Array  # the distance that the geometry has, whatever a user gives, shape (n,)
+    # the distance between the smooth surfaces that the facets of both sides stand for, shape (n,)
     curved_gap: Array
+    # whether the facets change the gap by more than that of the smooth surfaces varies from node to
+    # node, shape (n,)
     conforms: Array
+    # integral ∫φ_i of the node's hat over the contact surface, of a pair over what the other side
+    # covers of it, shape (n,)
     area: Array
-    covered: Array
+    covered: Array  # the share of that integral over the whole surface, 1 at an obstacle, (n,)
+    # whether a row is made at once; a condition out of reach gets one only if the solution violates
+    # it, shape (n,)
     within_reach: Array
-    condition: Array
-    entry_group: Array
-    weight: Array
-    friction: Array
-    place: Array
-    motion: Array
-    candidates: int = 0
+    condition: Array  # condition of each weight, shape (k,)
+    entry_group: Array  # global group of each weight, shape (k,)
+    weight: Array  # the w_ij, without a unit, shape (k,)
+    friction: Array  # `Friction` of each condition, shape (n,)
+    place: Array  # Σ_j w_ij x_j, where a rigid body that moves meets it, else 0, shape (n, gdim)
+    motion: Array  # displacement of that body there, as far as it is known, shape (n, gdim)
+    candidates: int = 0  # nodes of the contact surface whose groups this rank owns
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -142,17 +127,12 @@ def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
 
 @dataclass(frozen=True)
 class Side:
-    """A surface of a pair, or one that faces an obstacle.
+    """A surface of a pair, or one that faces an obstacle."""
 
-    Attributes:
-        facets: Its facets on this rank, those of a pair with averaged normals and curvature.
-        areas: ∫φ_i over each facet, shape ``(n, v)``.
-        normals: Direction in which each owned group may not go further: the averaged normal, at
-            an obstacle that towards the shape; 0 off the surface, shape ``(g, gdim)``.
-    """
-
-    facets: Facets
-    areas: Array
+    facets: Facets  # its facets on this rank, those of a pair with averaged normals and curvature
+    areas: Array  # ∫φ_i over each facet, shape (n, v)
+    # direction in which each owned group may not go further: the averaged normal, at an obstacle
+    # that towards the shape; 0 off the surface, shape (g, gdim)
     normals: Array
 
 

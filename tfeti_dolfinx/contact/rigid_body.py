@@ -45,17 +45,11 @@ def motion_fields(arm: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """Place of a rigid body, which takes X to p + Q(X − p) + t.
+    """Place of a rigid body, which takes X to p + Q(X − p) + t."""
 
-    Attributes:
-        point: p, shape ``(gdim,)``.
-        motion: t and the rotation vector of Q in the order of ``MOTIONS``, shape ``(k,)``.
-        finite: Whether Q is a rotation; else the small one 1 + [θ]×.
-    """
-
-    point: Array
-    motion: Array
-    finite: bool
+    point: Array  # p, shape (gdim,)
+    motion: Array  # t and the rotation vector of Q in the order of `MOTIONS`, shape (k,)
+    finite: bool  # whether Q is a rotation; else the small one 1 + [θ]×
 
     @property
     def centre(self) -> Array:

@@ -22,34 +22,21 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 @dataclass(frozen=True)
 class RigidEntries:
-    """Entries that unknowns of rigid bodies have in the v_i of conditions.
+    """Entries that unknowns of rigid bodies have in the v_i of conditions."""
 
-    Attributes:
-        condition: Condition of each entry, shape ``(k,)``.
-        unknown: Unknown among those of all rigid bodies, shape ``(k,)``.
-        direction: What v_i changes by, shape ``(k, gdim)``.
-    """
-
-    condition: Array
-    unknown: Array
-    direction: Array
+    condition: Array  # condition of each entry, shape (k,)
+    unknown: Array  # unknown among those of all rigid bodies, shape (k,)
+    direction: Array  # what v_i changes by, shape (k, gdim)
 
 
 @dataclass(frozen=True)
 class ToolMotion:
-    """Motion of a rigid body.
+    """Motion of a rigid body."""
 
-    Attributes:
-        name: Its name.
-        motion: Displacement and rotation vector of its point in the order of ``MOTIONS``.
-        centre: Where the point was when contact was searched, shape ``(gdim,)``.
-        contacts: The contacts that it is in.
-    """
-
-    name: str
-    motion: Array
-    centre: Array
-    contacts: Array
+    name: str  # its name
+    motion: Array  # displacement and rotation vector of its point in the order of `MOTIONS`
+    centre: Array  # where the point was when contact was searched, shape (gdim,)
+    contacts: Array  # the contacts that it is in
 
 
 class Tools:

@@ -28,17 +28,13 @@ from tfeti_dolfinx.subdomains.subdomains import SoftMotions, Subdomains
 
 @dataclass(frozen=True)
 class SoftParameters:
-    """Parameters of soft motions.
+    """Parameters of soft motions."""
 
-    Attributes:
-        steps: Steps of the power method.
-        large: The eigenvalue that it finds from which on a coarse problem pays: with cτ/H = 1.4 on
-            squares, 1.8 on cubes.
-        rounding: Of the stiffness of a motion's rows: the least energy that it is taken to have.
-    """
-
-    steps: int = 3
+    steps: int = 3  # steps of the power method
+    # the eigenvalue that it finds from which on a coarse problem pays: with cτ/H = 1.4 on squares,
+    # 1.8 on cubes
     large: float = 2.4
+    # of the stiffness of a motion's rows: the least energy that it is taken to have
     rounding: float = 1e-30
 
 

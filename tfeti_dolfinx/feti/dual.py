@@ -43,25 +43,20 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 @dataclass(frozen=True)
 class DualLimits:
-    """Limits of a dual problem.
+    """Limits of a dual problem."""
 
-    Attributes:
-        far: Times the forces and lengths that load, values and gaps make: multipliers of an earlier
-            problem that are larger would leave so many digits less to the solution.
-        least, most: Of stiffness, lengths and forces: beyond it squares leave the range of floating
-            point.
-        nearly: Motions held by less than this share of what the same contacts hold at most are
-            nearly free: their contacts' normals are off by less than 6 degrees from a right angle.
-        parallel: Loads whose directions differ by less are held by the same contacts.
-        recycled: Directions kept where options do not say how many: later ones gain hardly
-            anything, and each takes two vectors.
-    """
-
+    # times the forces and lengths that load, values and gaps make: multipliers of an earlier
+    # problem that are larger would leave so many digits less to the solution
     far: float = 1e3
+    # of stiffness, lengths and forces: below it squares leave the range of floating point
     least: float = 1e-130
-    most: float = 1e130
+    most: float = 1e130  # the same above
+    # motions held by less than this share of what the same contacts hold at most are nearly free:
+    # their contacts' normals are off by less than 6 degrees from a right angle
     nearly: float = 1e-2
-    parallel: float = 1e-12
+    parallel: float = 1e-12  # loads whose directions differ by less are held by the same contacts
+    # directions kept where options do not say how many: later ones gain hardly anything, and each
+    # takes two vectors
     recycled: int = 200
 
 

@@ -17,17 +17,11 @@ from tfeti_dolfinx.qp.sets import FeasibleSet
 
 @dataclass(frozen=True)
 class EnergyBound:
-    """A bound of ‖u − u*‖_K, u* the exact solution of the discrete problem; on all ranks.
+    """A bound of ‖u − u*‖_K, u* the exact solution of the discrete problem; on all ranks."""
 
-    Attributes:
-        error: The bound, a root of an energy; infinite where no forces balance the load.
-        gap: J(v) − q(λ) ≥ 0 of an admissible displacement v and of balanced forces λ.
-        moved: ‖u − u_λ‖_K, what it takes to balance the forces; 0 where they are.
-    """
-
-    error: float
-    gap: float
-    moved: float
+    error: float  # the bound, a root of an energy; infinite where no forces balance the load
+    gap: float  # J(v) − q(λ) ≥ 0 of an admissible displacement v and of balanced forces λ
+    moved: float  # ‖u − u_λ‖_K, what it takes to balance the forces; 0 where they are
 
 
 def energy_bound(

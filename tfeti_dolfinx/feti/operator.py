@@ -61,34 +61,25 @@ def near_stiffness(blocks: Sequence[SparseBlock], rigid: int = 0) -> tuple[csr_a
 
 @dataclass(frozen=True)
 class Metric:
-    """Energy norm in which displacements with given jumps are smoothed, on faces.
+    """Energy norm in which displacements with given jumps are smoothed, on faces."""
 
-    Attributes:
-        trace: K_bb.
-        near: Makes ``near_stiffness``, where a subdomain of some rank hardly
-            changes its volume; else None.
-        hard: Whether such a one is in space, where many steps cost less than they save.
-    """
-
-    trace: LocalOperator
+    trace: LocalOperator  # K_bb
+    # makes `near_stiffness`, where a subdomain of some rank hardly changes its volume; else None
     near: Callable[[], tuple[csr_array, Array]] | None
-    hard: bool
+    hard: bool  # whether such a one is in space, where many steps cost less than they save
 
 
 @dataclass(frozen=True)
 class PreconditionerChoice:
-    """Choice of the preconditioner.
+    """Choice of the preconditioner."""
 
-    Attributes:
-        dear: Mean entries of a column of a subdomain's factor, from which on S is dear: to make it
-            takes as long as a twentieth of so many multiplications by F.
-        steps: Multiplications by the lumped one, beyond which S pays: friendly scenes have taken 26
-            to 40 to 1e-6.
-        volume: (λ + 2μ)/μ, 20 of ν = 0.474, from which on what is inside has to follow a trace.
-    """
-
+    # mean entries of a column of a subdomain's factor, from which on S is dear: to make it takes as
+    # long as a twentieth of so many multiplications by F
     dear: float = 200.0
+    # multiplications by the lumped one, beyond which S pays: friendly scenes have taken 26 to 40 to
+    # 1e-6
     steps: int = 60
+    # (λ + 2μ)/μ, 20 of ν = 0.474, from which on what is inside has to follow a trace
     volume: float = 20.0
 
 

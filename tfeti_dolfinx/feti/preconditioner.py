@@ -25,29 +25,19 @@ OfArray = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class SmoothingParameters:
-    """Parameters of preconditioners on faces.
+    """Parameters of preconditioners on faces."""
 
-    Attributes:
-        steps: Chebyshev steps.
-        range: The part of the spectrum that they make small, from its top down.
-        many_steps: Steps for cells that keep their volumes, or that are flat: the top is ``high``.
-        wide_range: The same of the spectrum.
-        high: Top of the spectrum over diag K, from which on it is.
-        exact: Relative, of the top of the spectrum.
-        dense: Trace unknowns of a rank up to which eigenvalues come from a dense matrix.
-        orthonormal: Entry of B_C D⁻¹ B_Cᵀ − I, whose diagonal is 1, that is rounding.
-        shift: Added to the unit diagonal: rows that depend on each other leave no pivot, and B_fᵀ
-            takes away what the shift makes of them, down to rounding over it.
-    """
-
-    steps: int = 3
-    range: float = 8.0
+    steps: int = 3  # Chebyshev steps
+    range: float = 8.0  # the part of the spectrum that they make small, from its top down
+    # steps for cells that keep their volumes, or that are flat: the top is `high`
     many_steps: int = 12
-    wide_range: float = 100.0
-    high: float = 5.0
-    exact: float = 1e-2
-    dense: int = 20
-    orthonormal: float = 1e-12
+    wide_range: float = 100.0  # the same of the spectrum
+    high: float = 5.0  # top of the spectrum over diag K, from which on it is
+    exact: float = 1e-2  # relative, of the top of the spectrum
+    dense: int = 20  # trace unknowns of a rank up to which eigenvalues come from a dense matrix
+    orthonormal: float = 1e-12  # entry of B_C D⁻¹ B_Cᵀ − I, whose diagonal is 1, that is rounding
+    # added to the unit diagonal: rows that depend on each other leave no pivot, and B_fᵀ takes away
+    # what the shift makes of them, down to rounding over it
     shift: float = 1e-8
 
 

@@ -16,21 +16,14 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 @dataclass(frozen=True)
 class Recovered:
-    """Displacement of an iterate; all arrays are this rank's parts.
+    """Displacement of an iterate; all arrays are this rank's parts."""
 
-    Attributes:
-        lam: The multipliers λ, shape ``(m,)``.
-        u: The displacement, shape ``(n,)``.
-        gap: c − B u, shape ``(m,)``.
-        residual: Fλ − d, shape ``(m,)``.
-        active: Flags of contact rows whose force is more than the solver's error, and of rows of
-            friction that the face holds, shape ``(m,)``.
-    """
-
-    lam: Array
-    u: Array
-    gap: Array
-    residual: Array
+    lam: Array  # the multipliers λ, shape (m,)
+    u: Array  # the displacement, shape (n,)
+    gap: Array  # c − B u, shape (m,)
+    residual: Array  # Fλ − d, shape (m,)
+    # flags of contact rows whose force is more than the solver's error, and of rows of friction
+    # that the face holds, shape (m,)
     active: Array
 
 

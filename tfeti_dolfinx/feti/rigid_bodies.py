@@ -19,37 +19,30 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 @dataclass(frozen=True)
 class MotionTolerances:
-    """Tolerances of what counts as a free motion.
+    """Tolerances of what counts as a free motion."""
 
-    Attributes:
-        null: Stiffness, as a share of the stiffest motion of the same body, that counts as none:
-            rounding makes 1e-15 of it, and pins on neighbouring nodes of a fine mesh hold a turn
-            by 1e-9.
-        sprung: Share of a motion's square that lies outside a subdomain's kernel, and so moves a
-            spring: kernels beside weak springs are inexact, and a share is the square of an angle.
-        balance: Work of a body's load that counts as none, as a share of the largest that loads of
-            this size could do: what users balance by hand is seldom exact.
-        rounding: The same of the load of any body.
-        dependent: Eigenvalue of the modes' Gram matrix, as a share of the largest, that is none:
-            on nodes of a line or a point some mode is no motion of its own.
-        gluing: Size of a row on motions of bodies, over its own, below which it only glues.
-        no_grip: The same of an entry of another row that is only rounding.
-        takes_part: Of the largest coefficient of a motion: a body that moves by less takes no part.
-        dominant: A motion is named after modes of this share or more, which leaves out what a
-            rotation about another centre mixes in.
-        named: Bodies that a sentence names; of more it tells how many.
-    """
-
+    # stiffness, as a share of the stiffest motion of the same body, that counts as none: rounding
+    # makes 1e-15 of it, and pins on neighbouring nodes of a fine mesh hold a turn by 1e-9
     null: float = 1e-13
+    # share of a motion's square that lies outside a subdomain's kernel, and so moves a spring:
+    # kernels beside weak springs are inexact, and a share is the square of an angle
     sprung: float = 1e-8
+    # work of a body's load that counts as none, as a share of the largest that loads of this size
+    # could do: what users balance by hand is seldom exact
     balance: float = 1e-9
-    rounding: float = 1e-14
+    rounding: float = 1e-14  # the same of the load of any body
+    # eigenvalue of the modes' Gram matrix, as a share of the largest, that is none: on nodes of a
+    # line or a point some mode is no motion of its own
     dependent: float = 1e-12
+    # size of a row on motions of bodies, over its own, below which it only glues
     gluing: float = 1e-6
-    no_grip: float = 1e-12
+    no_grip: float = 1e-12  # the same of an entry of another row that is only rounding
+    # of the largest coefficient of a motion: a body that moves by less takes no part
     takes_part: float = 1e-3
+    # a motion is named after modes of this share or more, which leaves out what a rotation about
+    # another centre mixes in
     dominant: float = 0.3
-    named: int = 4
+    named: int = 4  # bodies that a sentence names; of more it tells how many
 
 
 TOLERANCES = MotionTolerances()
@@ -113,20 +106,14 @@ def independent(columns: Array) -> Array:
 
 @dataclass(frozen=True)
 class Motions:
-    """A space of motions of bodies, each of k coordinates.
+    """A space of motions of bodies, each of k coordinates."""
 
-    Attributes:
-        single: Orthonormal directions of each body, as columns, shape ``(bodies, k, k)``.
-        free: Which of them the body can take alone, shape ``(bodies, k)``.
-        stiffness: What holds each of them, as a share of the body's stiffest motion, its
-            neighbours at rest, shape ``(bodies, k)``.
-        joint: Motions of several bodies together, scipy CSR, shape ``(bodies * k, c)``.
-    """
-
-    single: Array
-    free: Array
+    single: Array  # orthonormal directions of each body, as columns, shape (bodies, k, k)
+    free: Array  # which of them the body can take alone, shape (bodies, k)
+    # what holds each of them, as a share of the body's stiffest motion, its neighbours at rest,
+    # shape (bodies, k)
     stiffness: Array
-    joint: csr_array
+    joint: csr_array  # motions of several bodies together, scipy CSR, shape (bodies * k, c)
 
     @cached_property
     def alone(self) -> csr_array:
@@ -331,25 +318,17 @@ class KernelBasis:
     so much that GGᵀ in the subdomains' own coordinates hides one behind the rounding of the other.
     Columns GᵀM know nothing of gluing, and those of motions that only contact holds nothing of
     conditions.
-
-    Attributes:
-        combined: Directions of each body as columns, so that M = bodies.motions @ combined, shape
-            ``(bodies * k, a)``.
-        motions: M, orthonormal, shape ``(r, a)``.
-        pins: Coordinates that M takes the place of.
-        rest: The others.
-        inverse: Inverse of M's rows at the pins.
-        unheld: Flags of the motions that no equality row resists, shape ``(a,)``.
-        free: Flags of the motions that no row resists, shape ``(a,)``.
     """
 
+    # directions of each body as columns, so that M = bodies.motions @ combined, shape (bodies * k,
+    # a)
     combined: csr_array
-    motions: csr_array
-    pins: Array
-    rest: Array
-    inverse: csr_array
-    unheld: Array
-    free: Array
+    motions: csr_array  # M, orthonormal, shape (r, a)
+    pins: Array  # coordinates that M takes the place of
+    rest: Array  # the others
+    inverse: csr_array  # inverse of M's rows at the pins
+    unheld: Array  # flags of the motions that no equality row resists, shape (a,)
+    free: Array  # flags of the motions that no row resists, shape (a,)
 
     def kernel(self, y: Array) -> Array:
         """T y."""

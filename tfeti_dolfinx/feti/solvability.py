@@ -21,26 +21,19 @@ from tfeti_dolfinx.feti.rigid_bodies import Bodies, Motions, free_to_move, ortho
 
 @dataclass(frozen=True)
 class SolvabilityParameters:
-    """Parameters of the linear programs.
+    """Parameters of the linear programs."""
 
-    Attributes:
-        slope: Least slope against a contact, of a motion of mean square 1, that is an overlap.
-        program: Tolerance of the programs.
-        work: Of the work of the load: less than this friction lets pass, so that a load at the
-            capacity is tried.
-        exact: The same for what is left of the work of friction where cutting planes end.
-        max_programs: Most programs; then the solver will see.
-        enough: The factor on friction that would hold is sought up to this, to a share.
-        share: That share.
-    """
-
+    # least slope against a contact, of a motion of mean square 1, that is an overlap
     slope: float = 1e-9
-    program: float = 1e-10
+    program: float = 1e-10  # tolerance of the programs
+    # of the work of the load: less than this friction lets pass, so that a load at the capacity is
+    # tried
     work: float = 1e-7
+    # the same for what is left of the work of friction where cutting planes end
     exact: float = 1e-7
-    max_programs: int = 300
-    enough: float = 1e3
-    share: float = 1e-4
+    max_programs: int = 300  # most programs; then the solver will see
+    enough: float = 1e3  # the factor on friction that would hold is sought up to this, to a share
+    share: float = 1e-4  # that share
 
 
 PARAMETERS = SolvabilityParameters()
@@ -57,24 +50,15 @@ class RigidScene:
     nothing overlaps: N y ≤ 0 for normals, P_i y + ‖M_i y‖ ≤ 0 under Coulomb's law, M_i = μ_i T_i,
     and Σ‖W_i y‖, W_i = ψ_i T_i, is the work of friction with given bounds. By Farkas' lemma forces
     balance the load just if no motion escapes.
-
-    Attributes:
-        load: Work of the load on each motion, shape ``(n,)``.
-        noise: Work that counts as none, shape ``(n,)``.
-        body: Body of each motion, shape ``(n,)``.
-        normals: N, shape ``(m, n)``.
-        pressing: P, shape ``(c, n)``.
-        cones: M, for each axis a matrix of shape ``(c, n)``.
-        given: W, the same with a row for each point.
     """
 
-    load: Array
-    noise: Array
-    body: Array
-    normals: csr_array
-    pressing: csr_array
-    cones: tuple[csr_array, ...] = ()
-    given: tuple[csr_array, ...] = ()
+    load: Array  # work of the load on each motion, shape (n,)
+    noise: Array  # work that counts as none, shape (n,)
+    body: Array  # body of each motion, shape (n,)
+    normals: csr_array  # N, shape (m, n)
+    pressing: csr_array  # P, shape (c, n)
+    cones: tuple[csr_array, ...] = ()  # M, for each axis a matrix of shape (c, n)
+    given: tuple[csr_array, ...] = ()  # W, the same with a row for each point
 
     def escape(self, factor: float = 1.0) -> Array | None:
         """Return a motion that escapes friction of so many times its size, if there is one.

@@ -24,29 +24,24 @@ ErrorTarget = Callable[[Array], float]
 
 @dataclass(frozen=True)
 class StoppingTolerances:
-    """Tolerances of an answer that is right, beside rtol.
+    """Tolerances of an answer that is right, beside rtol."""
 
-    Attributes:
-        noise: Rounding of displacements, of the largest of all bodies, or of the slip that friction
-            counts from.
-        load_noise: The same of what the load does to subdomains alone, and of gaps.
-        energy: Of rtol: error of u in energy over all bodies, so that forces are right where
-            bodies move much and deform little.
-        target: Of the other error, or of a 1e-5th of ‖u‖_K where that is more: the bound of the
-            algebraic error.
-        aim: Of the tolerance: residuals are aimed a little below what was asked for.
-        leap: A tolerance never falls by more at once, since the size of the displacement may have
-            been learnt from a poor iterate.
-        stall: The true residual has stalled if the digits it fell by are less than this share of
-            those that the updated one fell by.
-    """
-
+    # rounding of displacements, of the largest of all bodies, or of the slip that friction counts
+    # from
     noise: float = 2.5e-13
-    load_noise: float = 1e-14
+    load_noise: float = 1e-14  # the same of what the load does to subdomains alone, and of gaps
+    # of rtol: error of u in energy over all bodies, so that forces are right where bodies move much
+    # and deform little
     energy: float = 10.0
+    # of the other error, or of a 1e-5th of ‖u‖_K where that is more: the bound of the algebraic
+    # error
     target: float = 0.1
-    aim: float = 0.5
+    aim: float = 0.5  # of the tolerance: residuals are aimed a little below what was asked for
+    # a tolerance never falls by more at once, since the size of the displacement may have been
+    # learnt from a poor iterate
     leap: float = 1e-6
+    # the true residual has stalled if the digits it fell by are less than this share of those that
+    # the updated one fell by
     stall: float = 0.5
 
 
@@ -55,49 +50,28 @@ class StoppingTolerances:
 
 @dataclass(frozen=True)
 class Measures:
-    """An iterate in physical terms; the same on all ranks. Arrays have the shape ``(bodies,)``.
+    """An iterate in physical terms; the same on all ranks. Arrays have the shape ``(bodies,)``."""
 
-    Attributes:
-        size: Largest displacement of a node of each body, as a length.
-        elastic: The same but for a rigid motion.
-        energies: uᵀKu of each body.
-        correction: Largest displacement v of each body that closes jumps and overlaps.
-        correction_energies: vᵀ diag(K) v, its diagonal as in D the mean at each node.
-        change: Largest change of each body since the iterate before, or 0.
-        alone: Largest displacement K⁺f of the trace of each body.
-        stiffness: Trace of K on the trace unknowns of each body.
-        penetration: Deepest overlap, distance of a row that carries a force, or slip that friction
-            does not allow.
-        balance: Force left on a kernel mode, where it is largest beside the forces there.
-        forces: Size of these forces.
-        residual: Norm of what rows miss.
-        gap: Largest gap of a contact row, or overlap.
-        begin: Largest slip that friction counts from.
-        rounding: What rounding leaves of the residuals of rows that the face holds, however far
-            others are open.
-        error: Norm of the correction in energy, over all bodies.
-        energy: ‖u‖_K.
-        longest: The longest of what rows miss, and of what closes that.
-    """
-
-    size: Array
-    elastic: Array
-    energies: Array
-    correction: Array
-    correction_energies: Array
-    change: Array
-    alone: Array
-    stiffness: Array
+    size: Array  # largest displacement of a node of each body, as a length
+    elastic: Array  # the same but for a rigid motion
+    energies: Array  # uᵀKu of each body
+    correction: Array  # largest displacement v of each body that closes jumps and overlaps
+    correction_energies: Array  # vᵀ diag(K) v, its diagonal as in D the mean at each node
+    change: Array  # largest change of each body since the iterate before, or 0
+    alone: Array  # largest displacement K⁺f of the trace of each body
+    stiffness: Array  # trace of K on the trace unknowns of each body
+    # deepest overlap, distance of a row that carries a force, or slip that friction does not allow
     penetration: float
-    balance: float
-    forces: float
-    residual: float
-    gap: float
-    begin: float
+    balance: float  # force left on a kernel mode, where it is largest beside the forces there
+    forces: float  # size of these forces
+    residual: float  # norm of what rows miss
+    gap: float  # largest gap of a contact row, or overlap
+    begin: float  # largest slip that friction counts from
+    # what rounding leaves of the residuals of rows that the face holds, however far others are open
     rounding: float
-    error: float
-    energy: float
-    longest: float
+    error: float  # norm of the correction in energy, over all bodies
+    energy: float  # ‖u‖_K
+    longest: float  # the longest of what rows miss, and of what closes that
 
 
 def measure(
@@ -200,37 +174,23 @@ def _balance(coarse: CoarseSpace, lam: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class TargetStatus:
-    """Algebraic error of an iterate beside its target; the same on all ranks.
+    """Algebraic error of an iterate beside its target; the same on all ranks."""
 
-    Attributes:
-        bound: Bound of its algebraic error.
-        goal: The other error.
-        energy: ‖u‖_K.
-        allowed: Largest bound of the algebraic error that meets the target.
-    """
-
-    bound: EnergyBound
-    goal: float
-    energy: float
-    allowed: float
+    bound: EnergyBound  # bound of its algebraic error
+    goal: float  # the other error
+    energy: float  # ‖u‖_K
+    allowed: float  # largest bound of the algebraic error that meets the target
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Tolerances of an answer, in physical units.
+    """Tolerances of an answer, in physical units."""
 
-    Attributes:
-        displacement: Error of u for each body, a length, shape ``(bodies,)``.
-        jump: Jumps at tears, distances from Dirichlet values, overlaps, and distances where a
-            force acts.
-        balance: Force left on a kernel mode.
-        energy: Norm of the correction in energy, over all bodies.
-    """
-
-    displacement: Array
+    displacement: Array  # error of u for each body, a length, shape (bodies,)
+    # jumps at tears, distances from Dirichlet values, overlaps, and distances where a force acts
     jump: float
-    balance: float
-    energy: float
+    balance: float  # force left on a kernel mode
+    energy: float  # norm of the correction in energy, over all bodies
 
 
 class Accuracy(StoppingRule):

@@ -23,17 +23,11 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 
 @dataclass
 class Data:
-    """Data that a user may change, with a digest of their last values.
+    """Data that a user may change, with a digest of their last values."""
 
-    Attributes:
-        arrays: Gives the numbers as they are now.
-        comm: Communicator.
-        seen: The digest.
-    """
-
-    arrays: Callable[[], list[Array]]
-    comm: MPI.Intracomm
-    seen: bytes = b""
+    arrays: Callable[[], list[Array]]  # gives the numbers as they are now
+    comm: MPI.Intracomm  # communicator
+    seen: bytes = b""  # the digest
 
     def has_changed(self) -> bool:
         """Return whether data differ from the last call's, or this is the first. Collective."""

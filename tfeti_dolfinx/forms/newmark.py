@@ -41,22 +41,15 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Motion:
-    """State at the begin of a time step. Arrays are this rank's, in DOLFINx's numbering.
+    """State at the begin of a time step. Arrays are this rank's, in DOLFINx's numbering."""
 
-    Attributes:
-        u: Displacement.
-        v: Velocity.
-        load: Load.
-        towards: w, where the bodies would be without forces: u + τv, or a predictor.
-        size: The step τ, 0 before it is known.
-        start: Velocity that the step starts with: v, or what a predictor makes of it.
-    """
-
-    u: Array
-    v: Array
-    load: Array
+    u: Array  # displacement
+    v: Array  # velocity
+    load: Array  # load
+    # w, where the bodies would be without forces: u + τv, or a predictor
     towards: Array = field(default_factory=lambda: np.zeros(0))
-    size: float = 0.0
+    size: float = 0.0  # the step τ, 0 before it is known
+    # velocity that the step starts with: v, or what a predictor makes of it
     start: Array = field(default_factory=lambda: np.zeros(0))
 
     @property

@@ -14,21 +14,17 @@ from tfeti_dolfinx.common.parallel import box_over_ranks
 
 @dataclass(frozen=True)
 class BisectionParameters:
-    """Parameters of recursive coordinate bisection.
+    """Parameters of recursive coordinate bisection."""
 
-    Attributes:
-        flat: Cells that are so many times as long as thick make cuts follow layers and columns.
-        layer_gap: Midpoints farther apart than this, over the mean extent of a part's cells, are of
-            different layers; those of the simplices of a box are a third of it apart.
-        same_place: Over that gap: midpoints nearer to each other than this are at one place.
-        layer_places: Places that a layer has at most, six with the simplices of a box.
-        moved: A cut moves by this share of a part's cells at most, to lie between layers.
-    """
-
+    # cells that are so many times as long as thick make cuts follow layers and columns
     flat: float = 3.0
+    # midpoints farther apart than this, over the mean extent of a part's cells, are of different
+    # layers; those of the simplices of a box are a third of it apart
     layer_gap: float = 0.4
+    # over that gap: midpoints nearer to each other than this are at one place
     same_place: float = 0.25
-    layer_places: int = 6
+    layer_places: int = 6  # places that a layer has at most, six with the simplices of a box
+    # a cut moves by this share of a part's cells at most, to lie between layers
     moved: float = 0.25
 
 

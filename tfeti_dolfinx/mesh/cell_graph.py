@@ -25,20 +25,13 @@ class Pieces:
     """Pieces of cells of one colour that hang together by facets, the same on all ranks.
 
     They are sorted by colour; of one colour the largest is the first (ties: lowest cell id).
-
-    Attributes:
-        of_cell: Piece of each cell of this rank, shape ``(n,)``.
-        colour: Colour of each piece, shape ``(p,)``.
-        size: Its number of cells, shape ``(p,)``.
-        links: Pairs of pieces that share facets, both ways, shape ``(l, 2)``.
-        facets: The number of these facets, shape ``(l,)``.
     """
 
-    of_cell: Array
-    colour: Array
-    size: Array
-    links: Array
-    facets: Array
+    of_cell: Array  # piece of each cell of this rank, shape (n,)
+    colour: Array  # colour of each piece, shape (p,)
+    size: Array  # its number of cells, shape (p,)
+    links: Array  # pairs of pieces that share facets, both ways, shape (l, 2)
+    facets: Array  # the number of these facets, shape (l,)
 
 
 class CellGraph:

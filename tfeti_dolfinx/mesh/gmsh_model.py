@@ -44,25 +44,16 @@ class Elements:
 
 @dataclass(frozen=True)
 class ModelContent:
-    """Content of one gmsh model: elements in physical groups, names, nodes.
+    """Content of one gmsh model: elements in physical groups, names, nodes."""
 
-    Attributes:
-        where: What messages call the model.
-        top: Highest dimension of the physical groups, 0 if there are none.
-        elements: Elements in physical groups, of this dimension and the one below.
-        names: Names of the physical groups of each dimension.
-        node_ids: Ids of the nodes of the elements of the highest dimension, ascending.
-        x: Their coordinates, shape ``(p, 3)``.
-        num_partitions: Number of partitions that gmsh knows of.
-    """
-
-    where: str
-    top: int
+    where: str  # what messages call the model
+    top: int  # highest dimension of the physical groups, 0 if there are none
+    # elements in physical groups, of this dimension and the one below
     elements: dict[int, Elements]
-    names: dict[int, dict[str, int]]
-    node_ids: Array
-    x: Array
-    num_partitions: int
+    names: dict[int, dict[str, int]]  # names of the physical groups of each dimension
+    node_ids: Array  # ids of the nodes of the elements of the highest dimension, ascending
+    x: Array  # their coordinates, shape (p, 3)
+    num_partitions: int  # number of partitions that gmsh knows of
 
 
 @contextmanager

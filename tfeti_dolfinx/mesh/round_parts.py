@@ -19,42 +19,32 @@ from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
 
 @dataclass(frozen=True)
 class RoundParameters:
-    """Parameters of round parts.
+    """Parameters of round parts."""
 
-    Attributes:
-        stages: Of k-means: points of each part that are looked at, rounds with them, and the share
-            of the way to the means that centres go in a round. Few points find the centres roughly,
-            more make them better, and all points find the parts.
-        influence_step: Factor by which a part's influence changes in a round at most.
-        influence: Of the distance to the next centre, which a part's influence is at most.
-        candidates: Parts that a point may join in a round, those nearest to its own.
-        fewest: Cells of a part in the mean, below which parts are those of bisection.
-        largest: Size over the mean, above which round parts are not taken.
-        facet: Weight of a facet over that of a vertex that a cell shares with another part.
-        flattening: Rounds in which cells change sides, until interfaces are flat.
-        gains: Size over the mean, above which a part gains no cells where interfaces are flattened.
-        loses: Size over the mean, below which it loses none.
-        slender: Bisection is tried where the ratio of a part's principal radii is at most so many
-            times that of round parts.
-        bits: Of the whole numbers that midpoints become along each axis.
-    """
-
+    # of k-means: points of each part that are looked at, rounds with them, and the share of the way
+    # to the means that centres go in a round. Few points find the centres roughly, more make them
+    # better, and all points find the parts
     stages: tuple[tuple[float, int, float], ...] = (
         (300, 50, 0.5),
         (1000, 10, 0.5),
         (np.inf, 5, 0.0),
     )
-    influence_step: float = 1.1
+    influence_step: float = 1.1  # factor by which a part's influence changes in a round at most
+    # of the distance to the next centre, which a part's influence is at most
     influence: float = 0.8
-    candidates: int = 16
-    fewest: int = 20
-    largest: float = 1.5
+    candidates: int = 16  # parts that a point may join in a round, those nearest to its own
+    fewest: int = 20  # cells of a part in the mean, below which parts are those of bisection
+    largest: float = 1.5  # size over the mean, above which round parts are not taken
+    # weight of a facet over that of a vertex that a cell shares with another part
     facet: float = 12.0
-    flattening: int = 10
+    flattening: int = 10  # rounds in which cells change sides, until interfaces are flat
+    # size over the mean, above which a part gains no cells where interfaces are flattened
     gains: float = 1.08
-    loses: float = 0.93
+    loses: float = 0.93  # size over the mean, below which it loses none
+    # bisection is tried where the ratio of a part's principal radii is at most so many times that
+    # of round parts
     slender: float = 1.15
-    bits: int = 20
+    bits: int = 20  # of the whole numbers that midpoints become along each axis
 
 
 ROUND = RoundParameters()

@@ -99,30 +99,18 @@ class PhysicalNames:
 
 @dataclass(frozen=True)
 class UntornMesh:
-    """This rank's share of the untorn mesh.
+    """This rank's share of the untorn mesh."""
 
-    Attributes:
-        cell_type: Type of all cells.
-        element: Coordinate element (basix.ufl), the same on all ranks.
-        cells: Nodes of each cell in DOLFINx's order, their places in ``node_ids``, shape
-            ``(n, nodes_per_cell)``.
-        cell_ids: Original ids of the cells, shape ``(n,)``.
-        cell_tags: Material tags, shape ``(n,)``, NO_TAG where there is none.
-        facet_tags: Tags of the cells' facets, shape ``(n, facets_per_cell)``, NO_TAG likewise.
-        node_ids: Original ids of the nodes of these cells, each once, shape ``(p,)``.
-        x: Coordinates of these nodes, shape ``(p, gdim)``.
-        names: Names of the physical groups, the same on all ranks.
-    """
-
-    cell_type: dmesh.CellType
-    element: Any
+    cell_type: dmesh.CellType  # type of all cells
+    element: Any  # coordinate element (basix.ufl), the same on all ranks
+    # nodes of each cell in DOLFINx's order, their places in `node_ids`, shape (n, nodes_per_cell)
     cells: Array
-    cell_ids: Array
-    cell_tags: Array
-    facet_tags: Array
-    node_ids: Array
-    x: Array
-    names: PhysicalNames
+    cell_ids: Array  # original ids of the cells, shape (n,)
+    cell_tags: Array  # material tags, shape (n,), NO_TAG where there is none
+    facet_tags: Array  # tags of the cells' facets, shape (n, facets_per_cell), NO_TAG likewise
+    node_ids: Array  # original ids of the nodes of these cells, each once, shape (p,)
+    x: Array  # coordinates of these nodes, shape (p, gdim)
+    names: PhysicalNames  # names of the physical groups, the same on all ranks
 
     @property
     def gdim(self) -> int:

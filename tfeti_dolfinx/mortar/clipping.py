@@ -13,17 +13,11 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 @dataclass(frozen=True)
 class CommonParts:
-    """Convex parts of lines or planes, one for each pair of facets.
+    """Convex parts of lines or planes, one for each pair of facets."""
 
-    Attributes:
-        vertices: In order, shape ``(n, k, tdim)``.
-        count: How many of them are used, 0 where there is no part, shape ``(n,)``.
-        size: Length or area, shape ``(n,)``.
-    """
-
-    vertices: Array
-    count: Array
-    size: Array
+    vertices: Array  # in order, shape (n, k, tdim)
+    count: Array  # how many of them are used, 0 where there is no part, shape (n,)
+    size: Array  # length or area, shape (n,)
 
     def __getitem__(self, rows: Array) -> CommonParts:
         return CommonParts(self.vertices[rows], self.count[rows], self.size[rows])

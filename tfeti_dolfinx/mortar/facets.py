@@ -96,42 +96,26 @@ def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
 
 @dataclass(frozen=True)
 class FacetKind:
-    """Cell type and elements that all contact facets of a problem have in common.
+    """Cell type and elements that all contact facets of a problem have in common."""
 
-    Attributes:
-        facet: interval, triangle or quadrilateral.
-        hats: P1 (Q1) element of the multipliers.
-        displacement: Element of the displacement's trace.
-        geometry: Element of the geometry.
-    """
-
-    facet: str
-    hats: FacetElement
-    displacement: FacetElement
-    geometry: FacetElement
+    facet: str  # interval, triangle or quadrilateral
+    hats: FacetElement  # P1 (Q1) element of the multipliers
+    displacement: FacetElement  # element of the displacement's trace
+    geometry: FacetElement  # element of the geometry
 
 
 @dataclass(frozen=True)
 class Facets:
-    """Some facets, one row each.
+    """Some facets, one row each."""
 
-    Attributes:
-        x: Geometry nodes, vertices first, shape ``(n, g, gdim)``.
-        groups: Global groups of the displacement's nodes, vertices first, shape ``(n, t)``.
-        normal: Outward unit normal at the centre, shape ``(n, gdim)``.
-        vertex_normals: Unit normals at the vertices, at first the facet's own, then averaged ones,
-            shape ``(n, v, gdim)``.
-        area: Area (length in 2D), shape ``(n,)``.
-        curvature: Second derivatives of the height of a smooth surface over the facet's tangent
-            plane (``with_curvature``), negative where the body is convex; at first 0, shape
-            ``(n, gdim, gdim)``.
-    """
-
-    x: Array
-    groups: Array
-    normal: Array
+    x: Array  # geometry nodes, vertices first, shape (n, g, gdim)
+    groups: Array  # global groups of the displacement's nodes, vertices first, shape (n, t)
+    normal: Array  # outward unit normal at the centre, shape (n, gdim)
+    # unit normals at the vertices, at first the facet's own, then averaged ones, shape (n, v, gdim)
     vertex_normals: Array
-    area: Array
+    area: Array  # area (length in 2D), shape (n,)
+    # second derivatives of the height of a smooth surface over the facet's tangent plane
+    # (`with_curvature`), negative where the body is convex; at first 0, shape (n, gdim, gdim)
     curvature: Array
 
     def __len__(self) -> int:

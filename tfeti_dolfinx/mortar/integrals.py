@@ -134,17 +134,11 @@ def _rotations(A: Array) -> Array:
 
 @dataclass(frozen=True)
 class GapIntegrals:
-    """Pointwise gaps along the normals of the secondary facets' vertices, n_i·(x_p − x_s) = g.
+    """Pointwise gaps along the normals of the secondary facets' vertices, n_i·(x_p − x_s) = g."""
 
-    Attributes:
-        total: ∫ψ_i g, shape ``(f, v)``.
-        lowest: Smallest g on the covered part, shape ``(f, v)``.
-        highest: The largest one, infinite where a facet is covered in part, shape ``(f, v)``.
-    """
-
-    total: Array
-    lowest: Array
-    highest: Array
+    total: Array  # ∫ψ_i g, shape (f, v)
+    lowest: Array  # smallest g on the covered part, shape (f, v)
+    highest: Array  # the largest one, infinite where a facet is covered in part, shape (f, v)
 
 
 Triplets = tuple[Array, Array, Array]
@@ -152,39 +146,25 @@ Triplets = tuple[Array, Array, Array]
 
 @dataclass(frozen=True)
 class MortarIntegrals:
-    """Contributions of facets of a surface to the conditions of their vertices.
+    """Contributions of facets of a surface to the conditions of their vertices."""
 
-    Attributes:
-        vertices: Global groups of the facets' vertices, shape ``(f, v)``.
-        covered: ∫φ_i over the covered part of each facet, shape ``(f, v)``.
-        gap: Gap g along the node's normal, between the facets or of an obstacle.
-        curved_gap: That between the smooth surfaces that facets stand for.
-        entries: Triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign), ψ_i
-            the dual multipliers.
-    """
-
-    vertices: Array
-    covered: Array
-    gap: GapIntegrals
-    curved_gap: GapIntegrals
+    vertices: Array  # global groups of the facets' vertices, shape (f, v)
+    covered: Array  # ∫φ_i over the covered part of each facet, shape (f, v)
+    gap: GapIntegrals  # gap g along the node's normal, between the facets or of an obstacle
+    curved_gap: GapIntegrals  # that between the smooth surfaces that facets stand for
+    # triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign), ψ_i the dual
+    # multipliers
     entries: tuple[Triplets, ...]
 
 
 @dataclass(frozen=True)
 class DualMultipliers:
-    """Values of dual multipliers at quadrature points.
+    """Values of dual multipliers at quadrature points."""
 
-    Attributes:
-        facet: Facets that have points, shape ``(f,)``.
-        place: Place in ``facet`` of each point's facet, shape ``(m,)``.
-        weighted: Weight times ψ_i at each point, shape ``(m, v)``.
-        covered: ∫φ_i over the part that the points cover, shape ``(f, v)``.
-    """
-
-    facet: Array
-    place: Array
-    weighted: Array
-    covered: Array
+    facet: Array  # facets that have points, shape (f,)
+    place: Array  # place in `facet` of each point's facet, shape (m,)
+    weighted: Array  # weight times ψ_i at each point, shape (m, v)
+    covered: Array  # ∫φ_i over the part that the points cover, shape (f, v)
 
     def integrals(self, values: Array) -> Array:
         """∫ψ_i f on each facet, from values of f at the points: ``(m, …)`` to ``(f, v, …)``."""

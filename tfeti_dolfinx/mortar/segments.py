@@ -163,38 +163,23 @@ def _march(
 
 @dataclass(frozen=True)
 class FacingPoints:
-    """Points of secondary facets, and points of primary facets that they face.
+    """Points of secondary facets, and points of primary facets that they face."""
 
-    Attributes:
-        secondary: Secondary facet of each, shape ``(m,)``.
-        primary: Primary facet of each, shape ``(m,)``.
-        xi: Reference coordinates on the secondary facet, shape ``(m, tdim)``.
-        eta: Reference coordinates on the primary facet, shape ``(m, tdim)``.
-    """
-
-    secondary: Array
-    primary: Array
-    xi: Array
-    eta: Array
+    secondary: Array  # secondary facet of each, shape (m,)
+    primary: Array  # primary facet of each, shape (m,)
+    xi: Array  # reference coordinates on the secondary facet, shape (m, tdim)
+    eta: Array  # reference coordinates on the primary facet, shape (m, tdim)
 
 
 @dataclass(frozen=True)
 class Segments:
-    """The common parts of facing facets.
+    """The common parts of facing facets."""
 
-    Attributes:
-        points: Quadrature points.
-        weight: Their weights, areas on the secondary facet, shape ``(m,)``.
-        corners: The corners of the parts.
-        whole: Whether each secondary facet is covered wholly, shape ``(n,)``.
-        averted: Whether facets near enough were passed over because they do not face.
-    """
-
-    points: FacingPoints
-    weight: Array
-    corners: FacingPoints
-    whole: Array
-    averted: bool
+    points: FacingPoints  # quadrature points
+    weight: Array  # their weights, areas on the secondary facet, shape (m,)
+    corners: FacingPoints  # the corners of the parts
+    whole: Array  # whether each secondary facet is covered wholly, shape (n,)
+    averted: bool  # whether facets near enough were passed over because they do not face
 
 
 def find_segments(
@@ -238,23 +223,14 @@ def find_segments(
 
 @dataclass(frozen=True)
 class _Meetings:
-    """Pairs of facets with a common part on the secondary facet's plane.
+    """Pairs of facets with a common part on the secondary facet's plane."""
 
-    Attributes:
-        s: Secondary facet of each pair, shape ``(n,)``.
-        p: Primary facet.
-        corners: The primary facet's vertices on the plane, shape ``(n, v, tdim)``.
-        parts: The common parts.
-        cosine: Of the facets' normals.
-        distance: Along the normal, at the middle of the common part.
-    """
-
-    s: Array
-    p: Array
-    corners: Array
-    parts: CommonParts
-    cosine: Array
-    distance: Array
+    s: Array  # secondary facet of each pair, shape (n,)
+    p: Array  # primary facet
+    corners: Array  # the primary facet's vertices on the plane, shape (n, v, tdim)
+    parts: CommonParts  # the common parts
+    cosine: Array  # of the facets' normals
+    distance: Array  # along the normal, at the middle of the common part
 
     def __getitem__(self, rows: Array) -> _Meetings:
         return _Meetings(*(getattr(self, f.name)[rows] for f in fields(self)))

@@ -27,23 +27,19 @@ from tfeti_dolfinx.nonlinear.state import LawVariables
 
 @dataclass(frozen=True)
 class ReturnTolerances:
-    """Tolerances of the return to the yield surface.
+    """Tolerances of the return to the yield surface."""
 
-    Attributes:
-        yielding: Beyond the yield stress by less than this share a point is elastic: where a load
-            step begins the stress lies on the yield surface, up to rounding.
-        rtol: Of the yield stress, to which the return is solved.
-        max_it: Most Newton steps of the return, which is exact in one where hardening is linear.
-        perfect: Share of the elastic moduli that a tangent without hardening gets, so that its
-            only kernel are rigid motions; the residual has none of it.
-        definite: Share of the shear modulus that a tangent of finite strain keeps on all that
-            stretches: stresses near the moduli, as a trial displacement may have, take from it.
-    """
-
+    # beyond the yield stress by less than this share a point is elastic: where a load step begins
+    # the stress lies on the yield surface, up to rounding
     yielding: float = 1e-10
-    rtol: float = 1e-14
+    rtol: float = 1e-14  # of the yield stress, to which the return is solved
+    # most Newton steps of the return, which is exact in one where hardening is linear
     max_it: int = 50
+    # share of the elastic moduli that a tangent without hardening gets, so that its only kernel are
+    # rigid motions; the residual has none of it
     perfect: float = 1e-4
+    # share of the shear modulus that a tangent of finite strain keeps on all that stretches:
+    # stresses near the moduli, as a trial displacement may have, take from it
     definite: float = 1e-3
 
 
@@ -55,22 +51,16 @@ HARDENING = {"yield_stress": POSITIVE, "hardening": FROM_0, "saturation": FROM_0
 class IsotropicHardening:
     """Yield stress σ_y(p), as ``J2Plasticity`` has it, and the return to it.
 
-    Attributes:
-        yield_stress: Yield stress at the begin, a force per area, a number or numbers at points.
-        hardening: Linear hardening modulus, a force per area, likewise.
-        saturation: What the yield stress gains by Voce's hardening in the end, likewise.
-        rate: Rate of Voce's hardening, likewise.
-        tolerances: Those of the return.
-
     Raises:
         InputError: A number does not fit; the message names it.
     """
 
+    # yield stress at the begin, a force per area, a number or numbers at points
     yield_stress: Array
-    hardening: Array
-    saturation: Array
-    rate: Array
-    tolerances: ReturnTolerances
+    hardening: Array  # linear hardening modulus, a force per area, likewise
+    saturation: Array  # what the yield stress gains by Voce's hardening in the end, likewise
+    rate: Array  # rate of Voce's hardening, likewise
+    tolerances: ReturnTolerances  # those of the return
 
     def __post_init__(self) -> None:
         for name, expected in HARDENING.items():
@@ -116,19 +106,13 @@ class IsotropicHardening:
 
 @dataclass(frozen=True)
 class Quadrature:
-    """Quadrature of a law, and the spaces of its points.
+    """Quadrature of a law, and the spaces of its points."""
 
-    Attributes:
-        mesh: The torn mesh.
-        degree: Degree of the quadrature.
-        selective: Whether what resists a change of volume is integrated at the centre of a cell.
-        beside: How far from the centre, of a reference cell of length 1, the two points of that
-            rule are: FFCx 0.9 takes values at a single point for those of other rules, too.
-    """
-
-    mesh: Any
-    degree: int
-    selective: bool
+    mesh: Any  # the torn mesh
+    degree: int  # degree of the quadrature
+    selective: bool  # whether what resists a change of volume is integrated at the centre of a cell
+    # how far from the centre, of a reference cell of length 1, the two points of that rule are:
+    # FFCx 0.9 takes values at a single point for those of other rules, too
     beside: float = 1e-3
 
     @classmethod

@@ -21,47 +21,30 @@ from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
 @dataclass(frozen=True)
 class FrictionParameters:
-    """Parameters of Newton's method on Coulomb's law.
+    """Parameters of Newton's method on Coulomb's law."""
 
-    Attributes:
-        max_steps: Most steps.
-        patience: So many steps in a row without progress, and the method has failed.
-        progress: A residual below this share of the least one is progress.
-        memory: A step may not exceed the largest residual of so many steps before.
-        shortest: Steps are halved down to this share.
-        reduction: What a solve leaves of its residual at most.
-        followed: Of the share that the last step has left: what a solve leaves, so that the end is
-            superlinear; and of the target: no solve leaves less.
-        max_directions: Most directions of one solve.
-        unseen: Of the target: F of a way onto a face that is shorter, times ‖F‖, is not computed.
-        hard: Times ‖F‖: directions that bend more are held.
-        new: Of Az: what earlier directions leave of it, less is rounding.
-        gain: Of the residual: what a direction takes from it, less is no gain.
-        rounding: Of a residual: no λ that has it comes lower.
-        path_reduction: What solves on the path of growing friction leave of their residual: beside
-            soft motions ``reduction`` leaves all others.
-        path_steps: Most steps for one share of the coefficients.
-        path_length: Most steps on the whole path.
-        path_shortest: Its shortest step.
-    """
-
-    max_steps: int = 80
-    patience: int = 10
-    progress: float = 0.98
-    memory: int = 5
-    shortest: float = 0.01
-    reduction: float = 0.3
+    max_steps: int = 80  # most steps
+    patience: int = 10  # so many steps in a row without progress, and the method has failed
+    progress: float = 0.98  # a residual below this share of the least one is progress
+    memory: int = 5  # a step may not exceed the largest residual of so many steps before
+    shortest: float = 0.01  # steps are halved down to this share
+    reduction: float = 0.3  # what a solve leaves of its residual at most
+    # of the share that the last step has left: what a solve leaves, so that the end is superlinear;
+    # and of the target: no solve leaves less
     followed: float = 0.3
-    max_directions: int = 80
+    max_directions: int = 80  # most directions of one solve
+    # of the target: F of a way onto a face that is shorter, times ‖F‖, is not computed
     unseen: float = 0.1
-    hard: float = 10.0
-    new: float = 1e-7
-    gain: float = 1e-8
-    rounding: float = 1e-16
+    hard: float = 10.0  # times ‖F‖: directions that bend more are held
+    new: float = 1e-7  # of Az: what earlier directions leave of it, less is rounding
+    gain: float = 1e-8  # of the residual: what a direction takes from it, less is no gain
+    rounding: float = 1e-16  # of a residual: no λ that has it comes lower
+    # what solves on the path of growing friction leave of their residual: beside soft motions
+    # `reduction` leaves all others
     path_reduction: float = 1e-3
-    path_steps: int = 25
-    path_length: int = 200
-    path_shortest: float = 1e-4
+    path_steps: int = 25  # most steps for one share of the coefficients
+    path_length: int = 200  # most steps on the whole path
+    path_shortest: float = 1e-4  # its shortest step
 
 
 DEFAULT = FrictionParameters()
@@ -71,17 +54,11 @@ DEFAULT = FrictionParameters()
 
 @dataclass(frozen=True)
 class Law:
-    """λ ∈ Ω(λ_N), on this rank's rows: the set of a point's λ_T is λ_N times one of its own.
+    """λ ∈ Ω(λ_N), on this rank's rows: the set of a point's λ_T is λ_N times one of its own."""
 
-    Attributes:
-        at: Makes Ω of the λ_N of all points, shape ``(p,)``.
-        normals: Row of λ_N of each point, shape ``(p,)``.
-        tangents: Rows of its λ_T, shape ``(p, k)``.
-    """
-
-    at: Callable[[Array], FeasibleSet]
-    normals: Array
-    tangents: Array
+    at: Callable[[Array], FeasibleSet]  # makes Ω of the λ_N of all points, shape (p,)
+    normals: Array  # row of λ_N of each point, shape (p,)
+    tangents: Array  # rows of its λ_T, shape (p, k)
 
     def following(self, p: Array, face: Face) -> csr_array:
         """C: where points slip λ_T follows λ_N, λ_T = Cλ with the direction of p. Shape ``(m, m)``.
@@ -99,17 +76,11 @@ class Law:
 
 @dataclass(frozen=True)
 class LawPoint:
-    """Multipliers, this rank's part.
+    """Multipliers, this rank's part."""
 
-    Attributes:
-        lam: λ.
-        s: Fλ − d − Gᵀμ.
-        mu: μ, replicated.
-    """
-
-    lam: Array
-    s: Array
-    mu: Array
+    lam: Array  # λ
+    s: Array  # Fλ − d − Gᵀμ
+    mu: Array  # μ, replicated
 
 
 @dataclass(frozen=True)
@@ -118,20 +89,15 @@ class LawProgram:
 
     With y = λ − s/‖F‖ and P the projection onto Ω(y_N⁺) it is the natural map of Coulomb's law:
     λ = P(y) and Gλ = e.
-
-    Attributes:
-        qp: F, d and G; its set is not looked at.
-        law: The sets.
-        oblique: Makes the projectors of a face and of C, what follows it: P of λ = (I + C)u with
-            ``coordinates``, ``project`` and ``restoring`` as in ``ObliqueProjectors``.
-        norm: ‖F‖, or an estimate.
-        share: Of all coefficients of friction: Ω(share λ_N) is the set; 0: contact without any.
     """
 
-    qp: QP
-    law: Law
+    qp: QP  # F, d and G; its set is not looked at
+    law: Law  # the sets
+    # makes the projectors of a face and of C, what follows it: P of λ = (I + C)u with
+    # `coordinates`, `project` and `restoring` as in `ObliqueProjectors`
     oblique: Callable[[Face, csr_array], Any]
-    norm: float
+    norm: float  # ‖F‖, or an estimate
+    # of all coefficients of friction: Ω(share λ_N) is the set; 0: contact without any
     share: float = 1.0
 
     def natural_map(self, at: LawPoint) -> tuple[FeasibleSet, Array, float]:

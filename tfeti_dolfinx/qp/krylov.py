@@ -66,29 +66,22 @@ def estimate_norm(F: Operator, coarse: Coarse, steps: int = 15) -> float:
 
 @dataclass(frozen=True)
 class PcpgParameters:
-    """Tolerances of PCPG.
+    """Tolerances of PCPG."""
 
-    Attributes:
-        flat: Of the largest curvature of a direction, and of what the preconditioner makes of a
-            residual: less is rounding, as where rows depend on each other.
-        numbers: What a rank keeps of directions at most: 192 MB.
-        plateau: So many steps in which neither ‖r‖ comes down to a half nor q by what stands out
-            from its rounding have met rounding: at that pace 10 000 steps would bring 6 digits at
-            best; twice as many as there are rows, and a few, have it too.
-        few: Those.
-        rounding: Of the terms of q.
-        drifted: Of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else
-            conjugate gradients begin anew.
-        short: Of λ: a way that is shorter may be rounding of Gλ = e.
-    """
-
+    # of the largest curvature of a direction, and of what the preconditioner makes of a residual:
+    # less is rounding, as where rows depend on each other
     flat: float = 1e-13
-    numbers: int = 24_000_000
+    numbers: int = 24_000_000  # what a rank keeps of directions at most: 192 MB
+    # so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its
+    # rounding have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as
+    # many as there are rows, and a few, have it too
     plateau: int = 500
-    few: int = 20
-    rounding: float = 1e-15
+    few: int = 20  # those
+    rounding: float = 1e-15  # of the terms of q
+    # of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else conjugate
+    # gradients begin anew
     drifted: float = 0.5
-    short: float = 1e-6
+    short: float = 1e-6  # of λ: a way that is shorter may be rounding of Gλ = e
 
 
 DEFAULT = PcpgParameters()
@@ -131,17 +124,11 @@ class Directions:
 
 @dataclass
 class Progress:
-    """Tells when neither residuals nor q have decreased for long.
+    """Tells when neither residuals nor q have decreased for long."""
 
-    Attributes:
-        best: The last ‖r‖ that was half of the one before.
-        most: Steps since then that are long.
-        steps: Steps since then, and gain how much lower q is.
-    """
-
-    best: float
-    most: int
-    steps: int = 0
+    best: float  # the last ‖r‖ that was half of the one before
+    most: int  # steps since then that are long
+    steps: int = 0  # steps since then, and gain how much lower q is
     gain: float = 0.0
 
     def step(self, norm: float, gain: float) -> None:

@@ -16,26 +16,19 @@ from tfeti_dolfinx.qp.sets import FeasibleSet, Status
 
 @dataclass(frozen=True)
 class MprgpParameters:
-    """Parameters of MPRGP.
+    """Parameters of MPRGP."""
 
-    Attributes:
-        alpha_bar: Fixed step length ᾱ, in (0, 2/‖A‖].
-        gamma: Γ > 0 of the proportioning test.
-        tangential: Of ‖β‖²: so much must be tangential for the face to be where work is left.
-        reduction: What conjugate gradients on a face reduce their residual to: one more
-            multiplication then brings the point back to the boundary.
-        most_steps: Most of them.
-        enough: Of the slope: what the cost must fall by for a step on a face to be taken.
-        rounding: Of ‖g‖‖x‖: what the cost may be wrong by, as g does not vanish where the boundary
-            is pushed against.
-    """
-
-    alpha_bar: float
-    gamma: float = 1.0
+    alpha_bar: float  # fixed step length ᾱ, in (0, 2/‖A‖]
+    gamma: float = 1.0  # Γ > 0 of the proportioning test
+    # of ‖β‖²: so much must be tangential for the face to be where work is left
     tangential: float = 0.5
+    # what conjugate gradients on a face reduce their residual to: one more multiplication then
+    # brings the point back to the boundary
     reduction: float = 0.3
-    most_steps: int = 30
-    enough: float = 0.1
+    most_steps: int = 30  # most of them
+    enough: float = 0.1  # of the slope: what the cost must fall by for a step on a face to be taken
+    # of ‖g‖‖x‖: what the cost may be wrong by, as g does not vanish where the boundary is pushed
+    # against
     rounding: float = 1e-15
 
 

@@ -32,27 +32,7 @@ RUBS = Status.STICK
 
 @dataclass(frozen=True)
 class NewtonParameters:
-    """Parameters of block Newton; options say themselves what they are.
-
-    Attributes:
-        enough: Share of (ᾱ/2)‖g^P‖², which the gradient step promises, that a step lowers q by.
-        final: Of the rule's tolerance: what no solve goes below, as ‖g^P‖ is not quite ‖P_f g‖.
-        stage: What a solve on a face that stays reduces its residual to, before step 1 looks at it.
-        patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
-        unfelt: Of the gradient: multipliers of Gλ = e that make it longer than that are rounding of
-            motions that a face does not see.
-        lost: Of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖.
-        rounding: Of the largest entry of a way: less is none.
-        hidden: Of the terms of q: what its differences may be wrong by.
-        short: Of a gradient: a projection that is shorter may be rounding.
-        beyond: Of the way to the first bound, where no curvature ends it: more rows than one are
-            to leave.
-        apart: Of ‖d‖: rows that want gaps so far apart exclude each other, less may be rounding.
-        takes_part: Of the largest force of such a direction: rows with less have no part in it.
-        far: How far such a direction is followed, to end in Ω's cone of recession.
-        unseen: Of ‖F‖‖w‖: what may be left of Fw where F is not to see a direction w.
-        purifying: Most steps of PCPG to that.
-    """
+    """Parameters of block Newton; options say themselves what they are."""
 
     gamma: float = described(
         1.0,
@@ -69,21 +49,29 @@ class NewtonParameters:
         name="newton_reduction",
         fits=Range("between 0 and 1", lambda value: 0.0 < value < 1.0),
     )
+    # share of (ᾱ/2)‖g^P‖², which the gradient step promises, that a step lowers q by
     enough: float = 0.1
+    # of the rule's tolerance: what no solve goes below, as ‖g^P‖ is not quite ‖P_f g‖
     final: float = 0.9
+    # what a solve on a face that stays reduces its residual to, before step 1 looks at it
     stage: float = 0.1
-    patience: int = 10
+    patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
+    # of the gradient: multipliers of Gλ = e that make it longer than that are rounding of motions
+    # that a face does not see
     unfelt: float = 1e6
-    lost: float = 2e-15
-    rounding: float = 1e-10
-    hidden: float = 1e-15
-    short: float = 1e-6
+    lost: float = 2e-15  # of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖
+    rounding: float = 1e-10  # of the largest entry of a way: less is none
+    hidden: float = 1e-15  # of the terms of q: what its differences may be wrong by
+    short: float = 1e-6  # of a gradient: a projection that is shorter may be rounding
+    # of the way to the first bound, where no curvature ends it: more rows than one are to leave
     beyond: float = 10.0
+    # of ‖d‖: rows that want gaps so far apart exclude each other, less may be rounding
     apart: float = 1e-8
+    # of the largest force of such a direction: rows with less have no part in it
     takes_part: float = 1e-3
-    far: float = 1e30
-    unseen: float = 1e-14
-    purifying: int = 200
+    far: float = 1e30  # how far such a direction is followed, to end in Ω's cone of recession
+    unseen: float = 1e-14  # of ‖F‖‖w‖: what may be left of Fw where F is not to see a direction w
+    purifying: int = 200  # most steps of PCPG to that
 
 
 # --- Step 0: start ----------------------------------------------------------------------------

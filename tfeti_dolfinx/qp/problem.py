@@ -38,49 +38,35 @@ class FaceOperator(Protocol):
 
 @dataclass
 class Point:
-    """Multipliers and their gradient.
+    """Multipliers and their gradient."""
 
-    Attributes:
-        lam: λ.
-        g: F λ − d, on all rows.
-    """
-
-    lam: Array
-    g: Array
+    lam: Array  # λ
+    g: Array  # F λ − d, on all rows
 
 
 @dataclass(frozen=True)
 class QP:
-    """min ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω.
+    """min ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω."""
 
-    Attributes:
-        F: Symmetric positive semidefinite operator.
-        d: Linear term.
-        coarse: Projectors of G, and a particular solution of Gλ = e.
-        feasible: The set Ω.
-        preconditioner: Approximate inverse of F, or None.
-        norm: Estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks.
-        preconditioner_on: Gives an approximate inverse of ZᵀFZ for a face Z, between vectors of
-            the face in the layout of all rows, until it is asked for another; or None.
-        seen: Largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none.
-        recycled: Directions of earlier solves, which those of PCPG are made F-orthogonal to.
-        held: Flags of the local rows that are 0 on the face of ``coarse``; None: of no face.
-        keeps: Whether a direction of PCPG is made conjugate to all before it, not the last alone.
-        foundation: Forces of a rank's rows if each were a spring that its gap presses, as stiff as
-            bodies are where so many rows carry together; None: unknown.
-    """
-
-    F: Operator
-    d: Array
-    coarse: Coarse
-    feasible: FeasibleSet
-    preconditioner: Operator | None = None
-    norm: float = 1.0
+    F: Operator  # symmetric positive semidefinite operator
+    d: Array  # linear term
+    coarse: Coarse  # projectors of G, and a particular solution of Gλ = e
+    feasible: FeasibleSet  # the set Ω
+    preconditioner: Operator | None = None  # approximate inverse of F, or None
+    norm: float = 1.0  # estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks
+    # gives an approximate inverse of ZᵀFZ for a face Z, between vectors of the face in the layout
+    # of all rows, until it is asked for another; or None
     preconditioner_on: Callable[[Face], Operator] | None = None
+    # largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none
     seen: float = 0.0
+    # directions of earlier solves, which those of PCPG are made F-orthogonal to
     recycled: Recycled | None = None
+    # flags of the local rows that are 0 on the face of `coarse`; None: of no face
     held: Array | None = None
+    # whether a direction of PCPG is made conjugate to all before it, not the last alone
     keeps: bool = True
+    # forces of a rank's rows if each were a spring that its gap presses, as stiff as bodies are
+    # where so many rows carry together; None: unknown
     foundation: Callable[[int], Array] | None = None
 
     def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
@@ -139,46 +125,28 @@ class Steps:
 
 @dataclass
 class QPResult:
-    """Result of a QP solver.
+    """Result of a QP solver."""
 
-    Attributes:
-        lam: The multipliers λ.
-        mu: Multipliers μ of Gλ = e: the gradient is P(Fλ − d) + Gᵀμ.
-        gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
-        face: The face of λ, in which rows that carry a force are free.
-        reason: Why the solver stopped.
-        projected_gradient: ‖g^P‖ at the end.
-        equality: ‖Q x‖ at the end, x the homogenised unknown.
-        reference: b₀ = ‖P(d − F λ̄₀)‖.
-        norm: Estimate of ‖F‖ that ‖Q x‖ is weighted with.
-        steps: Steps taken.
-        excluding: Local rows that exclude each other, if that is why the solver stopped.
-    """
-
-    lam: Array
-    mu: Array
-    gradient: Array
-    face: Face
-    reason: ConvergedReason
-    projected_gradient: float
-    equality: float
-    reference: float
-    norm: float
-    steps: Steps = field(default_factory=Steps)
+    lam: Array  # the multipliers λ
+    mu: Array  # multipliers μ of Gλ = e: the gradient is P(Fλ − d) + Gᵀμ
+    gradient: Array  # Fλ − d up to the range of Gᵀ; on bound components the multiplier ν
+    face: Face  # the face of λ, in which rows that carry a force are free
+    reason: ConvergedReason  # why the solver stopped
+    projected_gradient: float  # ‖g^P‖ at the end
+    equality: float  # ‖Q x‖ at the end, x the homogenised unknown
+    reference: float  # b₀ = ‖P(d − F λ̄₀)‖
+    norm: float  # estimate of ‖F‖ that ‖Q x‖ is weighted with
+    steps: Steps = field(default_factory=Steps)  # steps taken
+    # local rows that exclude each other, if that is why the solver stopped
     excluding: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True)
 class Start:
-    """Initial guess of a solver.
+    """Initial guess of a solver."""
 
-    Attributes:
-        lam: Multipliers λ.
-        mu: Multipliers of Gλ = e; None: those of another K⁺, which say nothing.
-    """
-
-    lam: Array
-    mu: Array | None
+    lam: Array  # multipliers λ
+    mu: Array | None  # multipliers of Gλ = e; None: those of another K⁺, which say nothing
 
 
 # --- Homogenisation: λ = x + λ̄ with Gλ̄ = e, so that Gx = 0 --------------------------------------
@@ -250,21 +218,14 @@ class LastProduct:
 
 @dataclass(frozen=True)
 class Homogenised:
-    """min ½xᵀPFPx − bᵀx subject to Gx = 0, x + λ̄ ∈ Ω.
+    """min ½xᵀPFPx − bᵀx subject to Gx = 0, x + λ̄ ∈ Ω."""
 
-    Attributes:
-        lam_bar: λ̄.
-        gradient: F λ̄ − d.
-        b: P(d − F λ̄).
-        reference: Size of the residual at λ̄₀ = Gᵀ(GGᵀ)⁻¹e, b₀ = ‖P(d − F λ̄₀)‖, whatever λ̄ is.
-        rounding: What rounding leaves of b₀ where it should be 0.
-    """
-
-    lam_bar: Array
-    gradient: Array
-    b: Array
+    lam_bar: Array  # λ̄
+    gradient: Array  # F λ̄ − d
+    b: Array  # P(d − F λ̄)
+    # size of the residual at λ̄₀ = Gᵀ(GGᵀ)⁻¹e, b₀ = ‖P(d − F λ̄₀)‖, whatever λ̄ is
     reference: float
-    rounding: float
+    rounding: float  # what rounding leaves of b₀ where it should be 0
 
 
 def homogenise(
@@ -313,19 +274,16 @@ class StoppingRule:
 
     A solver compares max(‖g^P‖, ‖F‖‖Qx‖) with ``tolerance`` in every step. Where it is small
     enough, the iterate is examined; an examination that is not content lowers the tolerance.
-
-    Attributes:
-        tolerance: Norm of the residuals from which on an examination is worth its price.
-        drifted: Set where an examination finds that the solver's gradient is no longer true;
-            the solver makes it anew and takes the flag back.
-        norm: ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that
-            learns it on its way says so here.
-        waits: Whether an examination is to wait for solves on faces, whatever they aim at.
     """
 
-    tolerance: float
+    tolerance: float  # norm of the residuals from which on an examination is worth its price
+    # set where an examination finds that the solver's gradient is no longer true; the solver makes
+    # it anew and takes the flag back
     drifted: bool = False
+    # ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that learns it on
+    # its way says so here
     norm: float = 1.0
+    # whether an examination is to wait for solves on faces, whatever they aim at
     waits: bool = False
 
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
@@ -373,17 +331,12 @@ def no_monitor(
 
 @dataclass(frozen=True)
 class PrintMonitor:
-    """Prints a line per step on rank 0.
+    """Prints a line per step on rank 0."""
 
-    Attributes:
-        comm: Communicator.
-        feasible: The set; rows that it constrains and that carry a force are said to touch.
-        multiplications: Multiplications by F so far.
-    """
-
-    comm: MPI.Intracomm
+    comm: MPI.Intracomm  # communicator
+    # the set; rows that it constrains and that carry a force are said to touch
     feasible: FeasibleSet
-    multiplications: Callable[[], int]
+    multiplications: Callable[[], int]  # multiplications by F so far
 
     def __call__(
         self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float

@@ -17,38 +17,30 @@ UNBALANCED = 1e-3
 
 @dataclass(frozen=True)
 class ProjectionParameters:
-    """Parameters of the projection onto {λ ∈ Ω, Gλ = e}.
+    """Parameters of the projection onto {λ ∈ Ω, Gλ = e}."""
 
-    Attributes:
-        max_trials: Points looked at: far more than Newton takes where it converges.
-        balanced: Of the terms of Gλ − e: what the coarse problem's factors leave at best.
-        nearly: Of the same: below it a step that leaves more than ``slow`` has met the damping, a
-            kink, or rounding.
-        slow: Share of what is left.
-        slowly: So many such steps in a row, with the least damping, and rounding has ended it.
-        damping: Of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and
-            is small beside 1, so that they stay Newton's.
-        least_damping: The smallest that a factor bears: where bodies are hardly held.
-        eased: Factor on the damping after a whole step that has met no row but it: those of the
-            face may be so soft beside open ones that they hold by less.
-        shortest: Of Newton's step: less changes nothing that is left above rounding.
-        left: Of the slope at its start: a whole step that leaves as much has met only the damping.
-        patience: After so many of these in a row nothing in Ω fulfils Gλ = e but for rounding.
-        rounding: Of the cost: what rounding may add to it.
-    """
-
-    max_trials: int = 300
+    max_trials: int = 300  # points looked at: far more than Newton takes where it converges
+    # of the terms of Gλ − e: what the coarse problem's factors leave at best
     balanced: float = 1e-13
+    # of the same: below it a step that leaves more than `slow` has met the damping, a kink, or
+    # rounding
     nearly: float = 1e-6
-    slow: float = 0.1
+    slow: float = 0.1  # share of what is left
+    # so many such steps in a row, with the least damping, and rounding has ended it
     slowly: int = 8
+    # of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small
+    # beside 1, so that they stay Newton's
     damping: float = 1e-8
-    least_damping: float = 1e-14
+    least_damping: float = 1e-14  # the smallest that a factor bears: where bodies are hardly held
+    # factor on the damping after a whole step that has met no row but it: those of the face may be
+    # so soft beside open ones that they hold by less
     eased: float = 0.01
-    shortest: float = 1e-8
+    shortest: float = 1e-8  # of Newton's step: less changes nothing that is left above rounding
+    # of the slope at its start: a whole step that leaves as much has met only the damping
     left: float = 0.5
+    # after so many of these in a row nothing in Ω fulfils Gλ = e but for rounding
     patience: int = 10
-    rounding: float = 1e-14
+    rounding: float = 1e-14  # of the cost: what rounding may add to it
 
 
 DEFAULT = ProjectionParameters()
@@ -56,17 +48,11 @@ DEFAULT = ProjectionParameters()
 
 @dataclass(frozen=True)
 class FeasiblePoint:
-    """A point of Ω, and how far it is from Gλ = e.
+    """A point of Ω, and how far it is from Gλ = e."""
 
-    Attributes:
-        lam: The point, this rank's part.
-        alpha: λ = P_Ω(y + Gᵀα), replicated.
-        missing: How far Gλ is from e: the worst entry beside its terms, 1 at most.
-    """
-
-    lam: Array
-    alpha: Array
-    missing: float
+    lam: Array  # the point, this rank's part
+    alpha: Array  # λ = P_Ω(y + Gᵀα), replicated
+    missing: float  # how far Gλ is from e: the worst entry beside its terms, 1 at most
 
 
 def project_onto_feasible(

@@ -14,19 +14,14 @@ from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, dot_over, s
 
 @dataclass(frozen=True)
 class RecyclingParameters:
-    """Tolerances of directions that are kept.
+    """Tolerances of directions that are kept."""
 
-    Attributes:
-        new: Of the energy of a direction: what stands out from those that are kept; where less
-            does, rounding of their images would grow from one to the next.
-        wrong: Of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer
-            F of w.
-        held: Of the longest direction: less on rows that a face holds is rounding.
-    """
-
+    # of the energy of a direction: what stands out from those that are kept; where less does,
+    # rounding of their images would grow from one to the next
     new: float = 0.1
+    # of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer F of w
     wrong: float = 1e-9
-    held: float = 1e-10
+    held: float = 1e-10  # of the longest direction: less on rows that a face holds is rounding
 
 
 class DirectionStore:

@@ -167,13 +167,9 @@ class FeasibleSet(Protocol):
 
 @dataclass(frozen=True)
 class Bounds:
-    """x_i ≥ l_i.
+    """x_i ≥ l_i."""
 
-    Attributes:
-        lower: The bounds l, shape ``(n,)``, or one for all entries.
-    """
-
-    lower: Array | float = 0.0
+    lower: Array | float = 0.0  # the bounds l, shape (n,), or one for all entries
 
     def project(self, x: Array) -> Array:
         """max(x, l)."""

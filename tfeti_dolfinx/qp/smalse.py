@@ -27,16 +27,7 @@ from tfeti_dolfinx.qp.problem import (
 
 @dataclass(frozen=True)
 class SmalseParameters:
-    """Parameters of SMALSE-M and of its inner MPRGP, for F scaled to ‖PFP‖ = 1.
-
-    Attributes:
-        enough: Of the rule's tolerance: inner problems are not solved more exactly, as M may be
-            too small.
-        rounding: Of the Lagrangian: what its value may be wrong by.
-        change: Where nothing fulfils Bx = 0, ‖Bx‖ tends to a limit: a change by less than this
-            share is none; the slowest scenes change by 1e-3 a step.
-        patience: Outer steps without a change of ‖Bx‖ and M that are a stall.
-    """
+    """Parameters of SMALSE-M and of its inner MPRGP, for F scaled to ‖PFP‖ = 1."""
 
     rho: float = described(
         1.0, "smalse", "penalty ρ in units of ‖PFP‖", name="smalse_rho", symbol="ρ", fits=ABOVE_0
@@ -66,10 +57,13 @@ class SmalseParameters:
         symbol="ᾱ",
         fits=Range("more than 0, at most 2", lambda value: 0.0 < value <= 2.0),
     )
+    # of the rule's tolerance: inner problems are not solved more exactly, as M may be too small
     enough: float = 1e-3
-    rounding: float = 1e-14
+    rounding: float = 1e-14  # of the Lagrangian: what its value may be wrong by
+    # where nothing fulfils Bx = 0, ‖Bx‖ tends to a limit: a change by less than this share is none;
+    # the slowest scenes change by 1e-3 a step
     change: float = 1e-3
-    patience: int = 1000
+    patience: int = 1000  # outer steps without a change of ‖Bx‖ and M that are a stall
 
 
 class InnerTest:

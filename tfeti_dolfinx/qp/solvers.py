@@ -15,25 +15,18 @@ from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
 
 @dataclass(frozen=True)
 class Solver:
-    """QP solver, with its requirements.
+    """QP solver, with its requirements."""
 
-    Attributes:
-        solve: Solves a program from its homogenised form, with a stopping rule and ``parameters``;
-            by name ``max_it``, ``start`` and ``monitor``, as ``newton`` does.
-        parameters: Its parameters, where options have none of the solver's name.
-        keeps_sets: Whether it keeps inequalities and friction.
-        pc_type: Preconditioner that ``auto`` stands for.
-        relative_to_norm: Whether its steps are relative to ‖PFP‖.
-        cold: Where it starts, which is its λ̄; None: λ̄₀ = Gᵀ(GGᵀ)⁻¹e.
-        warm: From a start to its λ̄; None: λ̄ is as without one.
-    """
-
+    # solves a program from its homogenised form, with a stopping rule and `parameters`; by name
+    # `max_it`, `start` and `monitor`, as `newton` does
     solve: Callable[..., QPResult]
-    parameters: Any
-    keeps_sets: bool
-    pc_type: str
-    relative_to_norm: bool
+    parameters: Any  # its parameters, where options have none of the solver's name
+    keeps_sets: bool  # whether it keeps inequalities and friction
+    pc_type: str  # preconditioner that `auto` stands for
+    relative_to_norm: bool  # whether its steps are relative to ‖PFP‖
+    # where it starts, which is its λ̄; None: λ̄₀ = Gᵀ(GGᵀ)⁻¹e
     cold: Callable[[QP], Array] | None = None
+    # from a start to its λ̄; None: λ̄ is as without one
     warm: Callable[[QP, Start], Array] | None = None
 
 

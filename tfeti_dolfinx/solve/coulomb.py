@@ -29,69 +29,48 @@ from tfeti_dolfinx.solve.solver import solve_dual
 
 @dataclass(frozen=True)
 class CoulombParameters:
-    """Parameters of a solve with Coulomb's law.
+    """Parameters of a solve with Coulomb's law."""
 
-    Attributes:
-        newton: Those of Newton's method on the law.
-        tries: How often that may end and its bounds not be at rest.
-        finer: Factor on its target each time, and at least on its residual.
-        path_target: Of the first residual: what points on the path of growing friction are solved
-            to.
-        first: Relative tolerance of the first problem with given bounds.
-        share: Of the last change of bounds: that of the next one. Forces are less exact than
-            displacements.
-        near: Of what is wanted: a change from which on the next one may be small enough.
-        beside_rtol: Times rtol: change of bounds at rest, where options ask for no less.
-        with_target: Of the change of bounds at rest: rtol, where a target of the error in energy
-            takes its place, since forces have to be known to that change.
-        patience: Problems in a row whose change is not half of the least one before, and bounds do
-            not come to rest.
-        shortest: Of a step towards the forces found: bounds never take less of it.
-        falls: Problems in a row whose forces are less than half of their bounds: these fall to 0.
-        no_force: Of all multipliers: forces of normals that rounding makes of none. As bounds they
-            would be discs that bend so much that nothing else is seen beside them.
-        light: Of the largest forces of normals on a body: those of a lighter one count as so large.
-        rounding: Of ‖F‖‖λ‖: no residual is less.
-    """
-
-    newton: FrictionParameters = DEFAULT
-    tries: int = 4
-    finer: float = 0.03
+    newton: FrictionParameters = DEFAULT  # those of Newton's method on the law
+    tries: int = 4  # how often that may end and its bounds not be at rest
+    finer: float = 0.03  # factor on its target each time, and at least on its residual
+    # of the first residual: what points on the path of growing friction are solved to
     path_target: float = 1e-3
-    first: float = 1e-2
+    first: float = 1e-2  # relative tolerance of the first problem with given bounds
+    # of the last change of bounds: that of the next one. Forces are less exact than displacements
     share: float = 0.01
-    near: float = 10.0
+    near: float = 10.0  # of what is wanted: a change from which on the next one may be small enough
+    # times rtol: change of bounds at rest, where options ask for no less
     beside_rtol: float = 100.0
+    # of the change of bounds at rest: rtol, where a target of the error in energy takes its place,
+    # since forces have to be known to that change
     with_target: float = 0.1
+    # problems in a row whose change is not half of the least one before, and bounds do not come to
+    # rest
     patience: int = 12
-    shortest: float = 0.125
+    shortest: float = 0.125  # of a step towards the forces found: bounds never take less of it
+    # problems in a row whose forces are less than half of their bounds: these fall to 0
     falls: int = 2
+    # of all multipliers: forces of normals that rounding makes of none. As bounds they would be
+    # discs that bend so much that nothing else is seen beside them
     no_force: float = 1e-13
+    # of the largest forces of normals on a body: those of a lighter one count as so large
     light: float = 1e-6
-    rounding: float = 2e-16
+    rounding: float = 2e-16  # of ‖F‖‖λ‖: no residual is less
 
 
 @dataclass(frozen=True)
 class FixedPointStatus:
-    """Convergence of the bounds of friction.
+    """Convergence of the bounds of friction."""
 
-    Attributes:
-        iterations: Problems with given bounds that were solved; 0 without Coulomb's law.
-        change: Last change of the bounds, over their size.
-        tolerance: What that had to come down to.
-        last: Multiplications by F of the last problem.
-        body: The body on which they changed most at last, or that slides; -1 without Coulomb's law.
-        newton_steps: Steps of Newton's method on Coulomb's law, beside the problems.
-        slides: Whether no bounds were found that hold a body.
-    """
-
-    iterations: int = 0
-    change: float = 0.0
-    tolerance: float = 0.0
-    last: int = 0
+    iterations: int = 0  # problems with given bounds that were solved; 0 without Coulomb's law
+    change: float = 0.0  # last change of the bounds, over their size
+    tolerance: float = 0.0  # what that had to come down to
+    last: int = 0  # multiplications by F of the last problem
+    # the body on which they changed most at last, or that slides; -1 without Coulomb's law
     body: int = -1
-    newton_steps: int = 0
-    slides: bool = False
+    newton_steps: int = 0  # steps of Newton's method on Coulomb's law, beside the problems
+    slides: bool = False  # whether no bounds were found that hold a body
 
 
 def solve_with_friction(

@@ -36,27 +36,17 @@ OF_STEP = re.compile(
 
 @dataclass(frozen=True)
 class Index:
-    """Content of ``checkpoint.json``: the step that counts.
+    """Content of ``checkpoint.json``: the step that counts."""
 
-    Attributes:
-        number: How many steps have converged; 0: the folder is taken, nothing is kept yet.
-        ranks: The largest number of ranks that have written here.
-        states: Checksum of the state's file of each rank.
-        subdomains: Subdomains of each rank, which its file has.
-        digest: Describes what the user has given, see ``Checkpoint.write``.
-        about: What else is kept.
-        kind: The mark of a folder that a checkpoint owns.
-        version: Of this form.
-    """
-
-    number: int
-    ranks: int
-    states: list[str] = field(default_factory=list)
+    number: int  # how many steps have converged; 0: the folder is taken, nothing is kept yet
+    ranks: int  # the largest number of ranks that have written here
+    states: list[str] = field(default_factory=list)  # checksum of the state's file of each rank
+    # subdomains of each rank, which its file has
     subdomains: list[list[int]] = field(default_factory=list)
-    digest: Any = ""
-    about: dict[str, Any] = field(default_factory=dict)
-    kind: str = KIND
-    version: int = VERSION
+    digest: Any = ""  # describes what the user has given, see `Checkpoint.write`
+    about: dict[str, Any] = field(default_factory=dict)  # what else is kept
+    kind: str = KIND  # the mark of a folder that a checkpoint owns
+    version: int = VERSION  # of this form
 
     def owns(self, file: Path) -> bool:
         """Return whether the checkpoint writes a file of this name up to the next step."""
@@ -77,19 +67,13 @@ class Index:
 
 @dataclass(frozen=True)
 class Kept:
-    """Content of a checkpoint of a series, the same on all ranks.
+    """Content of a checkpoint of a series, the same on all ranks."""
 
-    Attributes:
-        index: The step that counts.
-        records: The record of each step.
-        fields: Checksums of the fields' files of all ranks, of each step; empty where none are.
-        subdomains: The subdomains that each of them has.
-    """
-
-    index: Index
-    records: list[dict[str, Any]]
+    index: Index  # the step that counts
+    records: list[dict[str, Any]]  # the record of each step
+    # checksums of the fields' files of all ranks, of each step; empty where none are
     fields: list[list[str]]
-    subdomains: list[list[list[int]]]
+    subdomains: list[list[list[int]]]  # the subdomains that each of them has
 
 
 class Checkpoint:

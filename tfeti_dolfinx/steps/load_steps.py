@@ -52,17 +52,11 @@ MOST_HALVINGS = 30
 
 @dataclass(frozen=True)
 class Place:
-    """Before a part of a step.
+    """Before a part of a step."""
 
-    Attributes:
-        number: The step.
-        done: Share of it that is done, a multiple of 2^-level.
-        level: How often it is halved now.
-    """
-
-    number: int = 0
-    done: float = 0.0
-    level: int = 0
+    number: int = 0  # the step
+    done: float = 0.0  # share of it that is done, a multiple of 2^-level
+    level: int = 0  # how often it is halved now
 
     def ahead(self) -> Place:
         """After a part that has converged: the next is as long as its place allows."""

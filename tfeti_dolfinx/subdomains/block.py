@@ -18,15 +18,10 @@ from tfeti_dolfinx.errors import InputError
 
 @dataclass
 class Counters:
-    """Counters of a rank's Blocks.
+    """Counters of a rank's Blocks."""
 
-    Attributes:
-        factorizations: Factorisations.
-        load_solves: Solves for K⁺f, one for each Block and load.
-    """
-
-    factorizations: int = 0
-    load_solves: int = 0
+    factorizations: int = 0  # factorisations
+    load_solves: int = 0  # solves for K⁺f, one for each Block and load
 
 
 @dataclass(frozen=True)
@@ -62,22 +57,18 @@ class SubdomainData:
 
 @dataclass(frozen=True)
 class KernelTolerances:
-    """Tolerances of kernels and fixing nodes.
+    """Tolerances of kernels and fixing nodes."""
 
-    Attributes:
-        null: Energy of a mode, over what its terms may be without their signs, that counts as
-            none: rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more.
-        dependent: Singular value of a mode beside the others, over the largest, that counts as
-            none: nodes on a line or in one point make it 0 but for rounding.
-        equal: Distances that differ by less, relatively, count as equal.
-        on_trace: Singular value of the kernel's trace rows, parts of orthonormal columns, below
-            which a motion is as good as 0 on the trace: K_ii resists it by the square of that,
-            which a Cholesky factor loses.
-    """
-
+    # energy of a mode, over what its terms may be without their signs, that counts as none:
+    # rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more
     null: float = 2e-15
+    # singular value of a mode beside the others, over the largest, that counts as none: nodes on a
+    # line or in one point make it 0 but for rounding
     dependent: float = 1e-10
-    equal: float = 1e-9
+    equal: float = 1e-9  # distances that differ by less, relatively, count as equal
+    # singular value of the kernel's trace rows, parts of orthonormal columns, below which a motion
+    # is as good as 0 on the trace: K_ii resists it by the square of that, which a Cholesky factor
+    # loses
     on_trace: float = 1e-6
 
 

@@ -18,25 +18,19 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteE
 
 @dataclass(frozen=True)
 class InverseTolerances:
-    """Tolerances of generalised inverses.
+    """Tolerances of generalised inverses."""
 
-    Attributes:
-        still: Entry of a kernel, over its largest, that is rounding.
-        rounding: Of the diagonal: what this makes positive definite was indefinite by rounding
-            only, which in assembly and factor comes to 1e-14 or so.
-        no_energy: Energy of a motion, over that of its entries alone, that counts as none.
-        counted: Motions without energy that are counted at most.
-        fine: Length of a subdomain over its shortest edge from which on rounding may hide the
-            energy of its softest deformations, which falls with the fourth power in sheets.
-        spread: Ratio of diagonal entries of K from which on rounding may do so.
-    """
-
-    still: float = 1e-8
+    still: float = 1e-8  # entry of a kernel, over its largest, that is rounding
+    # of the diagonal: what this makes positive definite was indefinite by rounding only, which in
+    # assembly and factor comes to 1e-14 or so
     rounding: float = 1e-12
+    # energy of a motion, over that of its entries alone, that counts as none
     no_energy: float = 1e-10
-    counted: int = 20
+    counted: int = 20  # motions without energy that are counted at most
+    # length of a subdomain over its shortest edge from which on rounding may hide the energy of its
+    # softest deformations, which falls with the fourth power in sheets
     fine: float = 1e3
-    spread: float = 1e8
+    spread: float = 1e8  # ratio of diagonal entries of K from which on rounding may do so
 
 
 TOLERANCES = InverseTolerances()
@@ -91,17 +85,11 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
 
 @dataclass(frozen=True)
 class InverseFactory:
-    """Factory of generalised inverses.
+    """Factory of generalised inverses."""
 
-    Attributes:
-        counters: Counts factorisations.
-        kplus: Makes the generalised inverse.
-        prefix: Prefix of the factors' PETSc options.
-    """
-
-    counters: Counters = field(default_factory=Counters)
-    kplus: MakeInverse = regularised
-    prefix: str = "tfeti_sub_"
+    counters: Counters = field(default_factory=Counters)  # counts factorisations
+    kplus: MakeInverse = regularised  # makes the generalised inverse
+    prefix: str = "tfeti_sub_"  # prefix of the factors' PETSc options
 
 
 # --- Causes of indefinite stiffnesses -----------------------------------------------------------

@@ -22,15 +22,10 @@ LOCAL_TYPES = ("auto", "implicit", "explicit", "shared")
 
 @dataclass(frozen=True)
 class LocalChoice:
-    """Choice of the form of local operators.
+    """Choice of the form of local operators."""
 
-    Attributes:
-        type: One of ``LOCAL_TYPES``.
-        multiplications: How many to expect.
-    """
-
-    type: str = "auto"
-    multiplications: int = 50
+    type: str = "auto"  # one of `LOCAL_TYPES`
+    multiplications: int = 50  # how many to expect
 
 
 # right sides that go through a factor at once: enough that it is not read for each, and few enough
@@ -42,29 +37,17 @@ TOGETHER = 32
 
 @dataclass
 class Group:
-    """Blocks that apply one symmetric matrix A on a trace: equal ones, or one alone.
+    """Blocks that apply one symmetric matrix A on a trace: equal ones, or one alone."""
 
-    Attributes:
-        count: Number of Blocks.
-        size: Rows of A.
-        columns: Vectors that A is applied to at once.
-        place: Where the trace unknowns go in these columns, the first column first.
-        where: Where they lie among those of the rank.
-        apply: A W, shapes ``(size,)`` or ``(size, q)``.
-        work: Operations of ``apply`` for a vector, 0 if they are not known.
-        can_be_dense: Whether there is use in a dense A.
-        dense: A, where that is cheaper.
-    """
-
-    count: int
-    size: int
-    columns: int
-    place: Array
-    where: Array
-    apply: Callable[[Array], Array]
-    work: float
-    can_be_dense: bool = True
-    dense: Array | None = None
+    count: int  # number of Blocks
+    size: int  # rows of A
+    columns: int  # vectors that A is applied to at once
+    place: Array  # where the trace unknowns go in these columns, the first column first
+    where: Array  # where they lie among those of the rank
+    apply: Callable[[Array], Array]  # a W, shapes (size,) or (size, q)
+    work: float  # operations of `apply` for a vector, 0 if they are not known
+    can_be_dense: bool = True  # whether there is use in a dense A
+    dense: Array | None = None  # a, where that is cheaper
 
     def prefers_dense(self, choice: LocalChoice) -> bool:
         """Return whether the group takes a dense matrix: by its type, or for fewer operations.

@@ -178,18 +178,14 @@ def stretch_over_shear(x: Array, bs: int, multiply: Callable[[Array], Array]) ->
 
 @dataclass(frozen=True)
 class EqualityTolerances:
-    """Tolerances of equal subdomains.
+    """Tolerances of equal subdomains."""
 
-    Attributes:
-        place: Of the size of a subdomain: nodes nearer than that have the same place. Which nodes
-            are meant is all that it decides, so it is far below a cell and far above rounding of
-            coordinates; the root keeps places of regular grids, which are rational, off the
-            middle between two roundings.
-        entry: Of the largest entry: rounding of a stiffness of cells of size h at x is
-            1e-16 x / h, and a modulus that differs by more is another one.
-    """
-
+    # of the size of a subdomain: nodes nearer than that have the same place. Which nodes are meant
+    # is all that it decides, so it is far below a cell and far above rounding of coordinates; the
+    # root keeps places of regular grids, which are rational, off the middle between two roundings
     place: float = 1e-7 * 2.0**0.5
+    # of the largest entry: rounding of a stiffness of cells of size h at x is 1e-16 x / h, and a
+    # modulus that differs by more is another one
     entry: float = 1e-12
 
 

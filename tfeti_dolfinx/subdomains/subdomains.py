@@ -38,15 +38,11 @@ from tfeti_dolfinx.subdomains.local_operators import (
 
 @dataclass(frozen=True)
 class RoundingTolerances:
-    """Tolerances below which motions and loads of subdomains are rounding.
+    """Tolerances below which motions and loads of subdomains are rounding."""
 
-    Attributes:
-        in_kernel: Part of a mode of length 1 outside of the kernel.
-        balanced: Of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm.
-            Ten times less was found where it balances itself; more moves the subdomain.
-    """
-
-    in_kernel: float = 1e-6
+    in_kernel: float = 1e-6  # part of a mode of length 1 outside of the kernel
+    # of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times
+    # less was found where it balances itself; more moves the subdomain
     balanced: float = 1e-14
 
 
@@ -55,15 +51,10 @@ TOLERANCES = RoundingTolerances()
 
 @dataclass(frozen=True)
 class SoftMotions:
-    """Motions R̂ of a rank that have a diagonal R̂ᵀKR̂ = D.
+    """Motions R̂ of a rank that have a diagonal R̂ᵀKR̂ = D."""
 
-    Attributes:
-        rows: R̂ on the trace, scipy CSR, shape ``(t, k)``.
-        energy: D, shape ``(k,)``.
-    """
-
-    rows: csr_array
-    energy: Array
+    rows: csr_array  # R̂ on the trace, scipy CSR, shape (t, k)
+    energy: Array  # D, shape (k,)
 
 
 def _outside_motions(block: Block) -> tuple[Array, Array]:
