@@ -149,7 +149,8 @@ class SeriesFile:
 
     Creation and methods are collective. ADIOS2 throws where a disk is full, throws again in its
     destructor, which ends the process, and lets other ranks wait for the one that has failed. So
-    what is to be written is reserved before.
+    what is to be written is reserved before. Creation raises an InputError where it cannot be
+    written, as all methods say, too.
 
     Args:
         name: Its name once it is whole.
@@ -158,9 +159,6 @@ class SeriesFile:
 
     Attributes:
         partial: Its name until then, or the folder.
-
-    Raises:
-        InputError: It cannot be written, as all methods say, too.
     """
 
     def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:

@@ -232,9 +232,8 @@ class ContactProblem:
     def _solve_in_rounds(self) -> None:
         """Solve, with more and more contact rows, until no node without a row overlaps.
 
-        Raises:
-            NoSolutionError: The problem has no solution, however far one looks.
-            ConvergenceError: Nodes without a row still overlap after many rounds.
+        Raise a NoSolutionError where the problem has no solution, however far one looks; a
+        ConvergenceError where nodes without a row still overlap after many rounds.
         """
         system = self._system
         for _ in range(MAX_ROUNDS):
@@ -565,8 +564,7 @@ class ContactProblem:
     def _meet(self, call: str) -> None:
         """Begin a call: check that all ranks make it with the same data. Collective.
 
-        Raises:
-            InputError: They do not, or the stress fails.
+        Raise an InputError where they do not, or the stress fails.
         """
         with agreeing(self.decomposition.comm, call) as given:
             given |= self._given()

@@ -244,8 +244,7 @@ class SavedState:
     def on_nodes(self, dofs: TornDofs) -> SavedState:
         """Return the state with nodes and cells in the order of this rank. Not collective.
 
-        Raises:
-            InputError: It has other ones.
+        Raise an InputError where it has other ones.
         """
         here = {"nodes": labels_of_nodes(dofs)}
         if self.internal.size:
@@ -255,8 +254,7 @@ class SavedState:
     def on_rows(self, gluing: Gluing) -> SavedState:
         """Return the state with rows and conditions in the order of a problem's. Collective.
 
-        Raises:
-            InputError: It has other ones.
+        Raise an InputError where it has other ones.
         """
         of_groups = labels_of_groups(gluing.dofs, self.nodes)
         here = {
@@ -324,9 +322,6 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
     """Raise unless a state is whole, of this mesh, on these ranks, with so many contacts.
 
     Not collective: a rank may have a broken one.
-
-    Raises:
-        InputError: It is not.
     """
     checked_type(state, SavedState, "state", "what ContactProblem.state returned")
     for f in fields(state):

@@ -88,11 +88,8 @@ class Settings:
 
         ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; ``tools``
         are rigid bodies, of which those with free motions get Blocks. Stiffnesses that ``equals``
-        knows are shared, unless the type of local operators is another.
-
-        Raises:
-            InputError: Stiffness or load do not fit.
-            FactorError: A factor could not be made.
+        knows are shared, unless the type of local operators is another. Raise an InputError where
+        stiffness or load do not fit; a FactorError where a factor could not be made.
         """
         own, options, decomposition = self.extensions, self.options, dofs.decomposition
         choice = LocalChoice(options.local_type, options.local_multiplications)
@@ -127,10 +124,9 @@ class Settings:
     ) -> tuple[Dual, Options]:
         """Return the dual problem, and the options with what ``auto`` stands for. Collective.
 
-        Raises:
-            InputError: The solver cannot keep the rows, or takes no preconditioner of one's own.
-            NoSolutionError: The load moves a body that nothing holds.
-            FactorError: A matrix could not be factored.
+        Raise an InputError where the solver cannot keep the rows, or takes no preconditioner of
+        one's own; a NoSolutionError where the load moves a body that nothing holds; a FactorError
+        where a matrix could not be factored.
         """
         rows, gdim = constraints.sets.contact_rows(dofs.comm), dofs.V.mesh.geometry.dim
         options = resolved(self.options, rows, self.prefix)
@@ -254,9 +250,8 @@ class System:
     def look_for_changes(self) -> None:
         """See whether the mesh, or what forms, conditions and laws refer to, has changed.
 
-        Raises:
-            InputError: Dirichlet conditions contradict each other, or a coefficient of friction
-                is negative or no number somewhere.
+        Raise an InputError where Dirichlet conditions contradict each other, or a coefficient of
+        friction is negative or no number somewhere.
         """
         changes = self.forms.changes() | self.tools.read(self.time)
         for what in (name for name in CHANGES if name in changes):
@@ -287,8 +282,7 @@ class System:
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
         """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
 
-        Raises:
-            InputError: A gap does not fit, or overlaps too deep. Nothing has changed.
+        Raise an InputError where a gap does not fit, or overlaps too deep. Nothing has changed.
         """
         contacts = {i: self._contacts[i].with_gap(gap) for i, gap in gaps.items()}
         if self._search is not None:
@@ -328,14 +322,13 @@ class System:
     def make_up_to(self, last: str, seconds: MutableMapping[str, float]) -> None:
         """Make what is out of date up to a stage. After an error its stage stays out of date.
 
+        Raise an InputError where Dirichlet values, contacts, stiffness or load do not fit; a
+        NoSolutionError where the problem has no solution; a FactorError where a matrix could not be
+        factored.
+
         Args:
             last: Name of the stage.
             seconds: Takes the seconds of each stage.
-
-        Raises:
-            InputError: Dirichlet values, contacts, stiffness or load do not fit.
-            NoSolutionError: The problem has no solution.
-            FactorError: A matrix could not be factored.
         """
         for name, (timed_as, make) in STAGES.items():
             if name in self._stale:

@@ -115,8 +115,7 @@ class Prescribed:
 def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     """Collect Dirichlet values and spread them to all copies of their nodes. Collective.
 
-    Raises:
-        InputError: Conditions contradict each other at a node, or are not finite.
+    Raise an InputError where conditions contradict each other at a node, or are not finite.
     """
     size = dofs.V.dofmap.index_map.size_local * dofs.bs
     values = prescribed_values(bcs, size)
@@ -147,9 +146,8 @@ def checked_conditions(
 ) -> list[fem.DirichletBC]:
     """Return the conditions as a list. Collective.
 
-    Raises:
-        InputError: They are no Dirichlet conditions on V or a component of V, or one of them has
-            no unknowns, or some that V has not.
+    Raise an InputError where they are no Dirichlet conditions on V or a component of V, or one of
+    them has no unknowns, or some that V has not.
     """
     conditions = listed_conditions(bcs)
     count = np.zeros(len(conditions), dtype=np.int64)
@@ -224,8 +222,7 @@ def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
 def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
     """Return the conditions as a list. Not collective.
 
-    Raises:
-        InputError: They are nothing that gives Dirichlet conditions.
+    Raise an InputError where they are nothing that gives Dirichlet conditions.
     """
     if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
         raise InputError(
@@ -290,6 +287,8 @@ class Gluing:
     def right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Array:
         """This rank's part of c for any prescribed values, gaps and slips; B stays. Collective.
 
+        Raise a NoSolutionError where prescribed components alone violate a condition.
+
         Args:
             values: Prescribed values of the owned groups, shape ``(g, bs)``; what stands at
                 components that are not prescribed has no effect.
@@ -298,9 +297,6 @@ class Gluing:
 
         Returns:
             Shape ``(num_rows,)``, for ``Constraints.c``.
-
-        Raises:
-            NoSolutionError: Prescribed components alone violate a condition.
         """
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
@@ -405,6 +401,9 @@ def glue(
 ) -> Gluing:
     """Rows of interfaces, Dirichlet conditions and contacts, and their right sides. Collective.
 
+    Raise a NoSolutionError where Dirichlet conditions and contacts contradict each other; an
+    InputError where a rigid body with free motions meets nodes that are prescribed.
+
     Args:
         dofs: Dof maps.
         prescribed: Dirichlet values.
@@ -415,10 +414,6 @@ def glue(
         slip: Where the load step begins: the tangential v_i of all conditions then, shape
             ``(n, gdim - 1)``; default 0.
         tools: Rigid bodies with free motions, if there are any.
-
-    Raises:
-        NoSolutionError: Dirichlet conditions and contacts contradict each other.
-        InputError: A rigid body with free motions meets nodes that are prescribed.
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
     rigid = tools.entries(records) if tools else None

@@ -185,9 +185,8 @@ def friction_values(
 ) -> Array:
     """Bounds or coefficients of conditions along tangents, ``(n, gdim - 1)``. Collective.
 
-    Raises:
-        InputError: A value is negative or no number somewhere, or a function on another mesh; the
-            message begins with the contact's name.
+    Raise an InputError where a value is negative or no number somewhere, or a function on another
+    mesh; the message begins with the contact's name.
     """
     x, what = group_points(dofs)[records.group], f"{name}: {friction.what}"
     columns = []
@@ -220,10 +219,8 @@ def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
 def numbers_at(what: str, value: Any, x: Array, lowest: float = -np.inf) -> Array:
     """Return a number for each point, shape ``(n, 3)``, from what a user gives. Not collective.
 
-    That is a number, a function of points of shape ``(3, n)``, or an array of their values.
-
-    Raises:
-        InputError: The function fails, or a number is not finite or below the lowest.
+    That is a number, a function of points of shape ``(3, n)``, or an array of their values. Raise
+    an InputError where the function fails, or a number is not finite or below the lowest.
     """
     if callable(value):
         try:

@@ -25,8 +25,9 @@ log = logging.getLogger(__name__)
 class ContactSearch:
     """Conditions of all contacts. Creation and all methods are collective.
 
-    Conditions out of a contact's reach have no rows at first; ``take_in_overlapping`` gives them
-    to those that a displacement violates, ``widen`` to those that may hold a body yet.
+    Conditions out of a contact's reach have no rows at first; ``take_in_overlapping`` gives them to
+    those that a displacement violates, ``widen`` to those that may hold a body yet. Creation raises
+    an InputError where a pair is there twice, or a contact raises it.
 
     Args:
         contacts: Obstacles and pairs.
@@ -42,9 +43,6 @@ class ContactSearch:
         length: Length of the scene.
         records: All conditions of this rank; those ``within_reach`` get rows.
         said: Contacts that ``warn_of`` has named last.
-
-    Raises:
-        InputError: A pair is there twice, or a contact raises it.
     """
 
     def __init__(

@@ -235,9 +235,6 @@ def check_placement(
         what: Begins messages.
         size: Length of the scene.
         comm: Communicator.
-
-    Raises:
-        InputError: Says what does not fit.
     """
     if callable(check := getattr(shape, "check_dimension", None)):
         check(gdim, what)

@@ -42,8 +42,9 @@ class ToolMotion:
 class Tools:
     """The rigid bodies that the contacts of a problem meet.
 
-    They have one unknown for each free motion, a length: of a turn, its angle times the size of
-    the surface. All of them are on the last rank, behind the unknowns of its nodes.
+    They have one unknown for each free motion, a length: of a turn, its angle times the size of the
+    surface. All of them are on the last rank, behind the unknowns of its nodes. Creation raises an
+    InputError where bodies do not fit the space, or two have the same name.
 
     Args:
         contacts: Obstacles and pairs.
@@ -63,9 +64,6 @@ class Tools:
         found: Motions of each body on top of that and of its law, of the last solve, shape
             ``(bodies, k)``; 0 but for free ones.
         begin: Where each body was when the load step began.
-
-    Raises:
-        InputError: Bodies do not fit the space, or two have the same name.
     """
 
     def __init__(self, contacts: Sequence[ContactPartner], dofs: TornDofs) -> None:
@@ -117,10 +115,7 @@ class Tools:
         """Take the values that laws have at a time; return what they change. Collective.
 
         That is ``right side`` where gaps change, ``places`` where a body has to be placed anew, and
-        ``load`` where a force or moment changes.
-
-        Raises:
-            InputError: A value does not fit.
+        ``load`` where a force or moment changes. Raise an InputError where a value does not fit.
         """
         if not self.bodies:
             return set()
@@ -248,11 +243,7 @@ class Tools:
         return RigidEntries(np.concatenate(rows), np.concatenate(columns), np.concatenate(values))
 
     def check_begin(self, contacts: Sequence[ContactPartner], records: ContactRecords) -> None:
-        """Raise if a rigid body begins inside of a surface. Collective.
-
-        Raises:
-            InputError: It names the body, and says how deep.
-        """
+        """Raise if a rigid body begins inside of a surface. Collective."""
         overlap = np.zeros(max(len(contacts), 1))
         np.maximum.at(overlap, records.contact, -records.geometric_gap)
         self._comm.Allreduce(MPI.IN_PLACE, overlap, op=MPI.MAX)
@@ -272,9 +263,6 @@ class Tools:
 
         Args:
             contact: Contact of each such condition on this rank.
-
-        Raises:
-            InputError: It names the body.
         """
         wrong = np.zeros(len(self.of_contact))
         wrong[contact] = 1.0

@@ -150,8 +150,7 @@ class CoarseSpace(Coarse):
     def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
         """Return the projectors on a face of the rows where others follow: λ = (I + C)u.
 
-        Raises:
-            FactorError: Forces on the face do not determine what balances a load.
+        Raise a FactorError where forces on the face do not determine what balances a load.
         """
         self.factors.count["face"] += int(self.dimension > 0)
         return ObliqueProjectors(self.grams, face, C, self.factors.null, self.comm)

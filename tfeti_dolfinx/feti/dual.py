@@ -80,6 +80,10 @@ def contact_set(constraints: Constraints) -> FeasibleSet:
 class Dual:
     """F, G, d and e of a scene. Creation and all methods are collective.
 
+    Creation raises an InputError where squares of stiffness, load or values leave the range of
+    floating point; a NoSolutionError where the load moves a body that nothing holds; a FactorError
+    where a matrix could not be factored.
+
     Args:
         constraints: B and c.
         subdomains: This rank's Blocks.
@@ -107,11 +111,6 @@ class Dual:
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
         last: The last solution of block Newton, or without a kernel, with its image.
         recycled: Directions of earlier solves; None: none are kept.
-
-    Raises:
-        InputError: Squares of stiffness, load or values leave the range of floating point.
-        NoSolutionError: The load moves a body that nothing holds.
-        FactorError: A matrix could not be factored.
     """
 
     def __init__(
@@ -179,9 +178,8 @@ class Dual:
     def update_load(self) -> None:
         """Take the Blocks' present loads and the present right sides.
 
-        Raises:
-            InputError: Squares of load or values leave the range of floating point.
-            NoSolutionError: The load moves a body that nothing holds.
+        Raise an InputError where squares of load or values leave the range of floating point; a
+        NoSolutionError where the load moves a body that nothing holds.
         """
         self._set_linear_term(self.coarse.comm)
         self.coarse.update_load()
@@ -218,8 +216,7 @@ class Dual:
     def lifting(self) -> LocalOperator:
         """S of this rank's subdomains: that of the preconditioner, or made for it.
 
-        Raises:
-            FactorError: The stiffness inside of a subdomain could not be factored.
+        Raise a FactorError where the stiffness inside of a subdomain could not be factored.
         """
         if self.late is not None:
             self.late.steps = 0

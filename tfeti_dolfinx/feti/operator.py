@@ -195,8 +195,7 @@ class LateDirichlet(DualOperator):
     def settle(self) -> None:
         """Make S where it is time. Collective.
 
-        Raises:
-            FactorError: The stiffness inside of a subdomain could not be factored.
+        Raise a FactorError where the stiffness inside of a subdomain could not be factored.
         """
         if self.metric is None and self.times >= self.steps:
             made = dirichlet_preconditioner(self.B, self._subdomains)

@@ -128,11 +128,7 @@ class FacePreconditioner:
             self.steps = chebyshev(steps, top / part, top)
 
     def on_face(self, face: Face) -> FaceOperator:
-        """M_f on a face. Collective.
-
-        Raises:
-            FactorError: W_C has no factor.
-        """
+        """M_f on a face. Collective. Raise a FactorError where W_C has no factor."""
         free, factor = np.zeros_like(face.free), None
         free[self._contact] = face.free[self._contact]
         on_contact = replace(face, free=free)
@@ -333,10 +329,7 @@ def smoothed(steps: list[tuple[float, float]], first: OfArray, then: OfArray, u:
 class ContactFactor:
     """Cholesky factor of an SPD matrix of contact rows, which is taken over; whole on each rank.
 
-    It is small and sparse. Creation is collective.
-
-    Raises:
-        FactorError: It could not be made.
+    It is small and sparse. Creation is collective, and raises a FactorError where it fails.
     """
 
     def __init__(self, A: PETSc.Mat, prefix: str) -> None:

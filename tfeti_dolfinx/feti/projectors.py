@@ -148,12 +148,10 @@ class SemidefiniteFactor:
     """A⁺ of a sparse positive semidefinite A, the same on all ranks, on each of them. Collective.
 
     S A S + E Eᵀ with a unit diagonal of S A S, E unit vectors of entries that determine the null
-    modes ``null``: an exact generalised inverse for right sides orthogonal
-    to them. Where a pivot is lost a small shift takes its place, made good by three steps of
-    refinement: each divides the error in a direction of eigenvalue σ by σ / shift.
-
-    Raises:
-        FactorError: The factor could not be made.
+    modes ``null``: an exact generalised inverse for right sides orthogonal to them. Where a pivot
+    is lost a small shift takes its place, made good by three steps of refinement: each divides the
+    error in a direction of eigenvalue σ by σ / shift. Creation raises a FactorError where the
+    factor could not be made.
     """
 
     def __init__(
@@ -225,12 +223,9 @@ class ObliqueProjectors:
     """P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ with H = G(I + C)ZG_fᵀ, of a face and C. Collective.
 
     λ = (I + C)u moves with u in the face, C led by rows that are directions of their own (normals):
-    G(I + C)u = 0 for u = Pv, and P makes nothing of what
-    G_fᵀ gives. With C = 0 it is the orthogonal projector of the face. H is G_fG_fᵀ and a part that
-    has the same null space; scaled and pinned as in ``SemidefiniteFactor``.
-
-    Raises:
-        FactorError: H is singular.
+    G(I + C)u = 0 for u = Pv, and P makes nothing of what G_fᵀ gives. With C = 0 it is the
+    orthogonal projector of the face. H is G_fG_fᵀ and a part that has the same null space; scaled
+    and pinned as in ``SemidefiniteFactor``. Creation raises a FactorError where H is singular.
     """
 
     def __init__(

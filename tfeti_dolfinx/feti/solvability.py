@@ -159,8 +159,7 @@ def _directions(rows: Sequence[csr_array], y: Array) -> tuple[Array, Array]:
 def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
     """Return the minimiser of a linear program over A y ≤ 0.
 
-    Raises:
-        TfetiError: Neither the simplex nor the interior point method found it.
+    Raise a TfetiError where neither the simplex nor the interior point method found it.
     """
     options = {
         "primal_feasibility_tolerance": PARAMETERS.program,
@@ -189,9 +188,6 @@ def check_solvable(
     """Raise if the load moves a body that neither contact nor friction can hold. Collective.
 
     ``load`` is its work on each motion of the bodies.
-
-    Raises:
-        NoSolutionError: Names the body, the motion, and what friction would have to hold.
     """
     motion = bcast_from_root(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
     reason = (

@@ -49,6 +49,9 @@ def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:
 class Forms:
     """The compiled forms of a problem. Creation and all methods are collective.
 
+    Creation raises an InputError where a form cannot be integrated on the torn mesh, or not be
+    compiled.
+
     Args:
         a: Bilinear form.
         L: Linear form.
@@ -62,9 +65,6 @@ class Forms:
         given: The forms as they were given, by their names.
         thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
             set.
-
-    Raises:
-        InputError: A form cannot be integrated on the torn mesh, or not be compiled.
     """
 
     names: ClassVar[tuple[str, str]] = ("a", "L")

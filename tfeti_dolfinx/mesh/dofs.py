@@ -113,9 +113,10 @@ def node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array
 class TornDofs:
     """Numberings of the nodes of a Lagrange space on a torn mesh.
 
-    A *node* is a point with ``bs`` unknowns. *Primal* numbering sorts a rank's nodes by
-    subdomain. A *group* is the set of all torn copies of a node, on any rank; it is owned by the
-    rank of its lowest subdomain. Creation and all methods that say so are collective.
+    A *node* is a point with ``bs`` unknowns. *Primal* numbering sorts a rank's nodes by subdomain.
+    A *group* is the set of all torn copies of a node, on any rank; it is owned by the rank of its
+    lowest subdomain. Creation and all methods that say so are collective. Creation raises an
+    InputError where ``V`` is not a space for displacements on the torn mesh.
 
     Args:
         V: Lagrange space on the torn mesh, scalar or blocked.
@@ -137,9 +138,6 @@ class TornDofs:
         copies: Global primal nodes of the owned groups, by subdomain, shape ``(c,)``.
         copy_subdomains: Their subdomains, shape ``(c,)``.
         nodes: Places of DOLFINx's nodes in finite strain, shape ``(n, 3)``; None: on the mesh.
-
-    Raises:
-        InputError: ``V`` is not a space for displacements on the torn mesh.
     """
 
     def __init__(self, V: fem.FunctionSpace, decomposition: Decomposition) -> None:

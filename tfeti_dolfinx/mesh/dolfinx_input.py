@@ -140,8 +140,7 @@ def _located(
 ) -> tuple[Any, dmesh.MeshTags | None]:
     """Give what markers locate tags of their own, above those that are there. Collective.
 
-    Raises:
-        InputError: A marker fails, finds nothing, or finds what has another tag.
+    Raise an InputError where a marker fails, finds nothing, or finds what has another tag.
     """
     markers = {k: v for k, v in names.items() if callable(v)} if isinstance(names, Mapping) else {}
     if not markers:

@@ -303,8 +303,7 @@ def _solve(A: Array, b: Array) -> Array:
 def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
     """Local facets of a contact surface, ascending. Collective.
 
-    Raises:
-        InputError: The surface is unknown, empty, or lies inside a body.
+    Raise an InputError where the surface is unknown, empty, or lies inside a body.
     """
     facets = decomposition.facets(name)
     comm = decomposition.comm

@@ -51,8 +51,7 @@ HARDENING = {"yield_stress": POSITIVE, "hardening": FROM_0, "saturation": FROM_0
 class IsotropicHardening:
     """Yield stress σ_y(p), as ``J2Plasticity`` has it, and the return to it.
 
-    Raises:
-        InputError: A number does not fit; the message names it.
+    Creation raises an InputError where a number does not fit; the message names it.
     """
 
     # yield stress at the begin, a force per area, a number or numbers at points
@@ -119,8 +118,7 @@ class Quadrature:
     def of(cls, u: fem.Function, degree: int | None, selective: bool) -> Quadrature:
         """Return that of a displacement; the default degree is exact on affine cells.
 
-        Raises:
-            InputError: Selective integration does not fit the displacement.
+        Raise an InputError where selective integration does not fit the displacement.
         """
         V = u.function_space
         own, cell = V.element.basix_element.degree, V.mesh.basix_cell()
@@ -207,8 +205,7 @@ class Plasticity(ABC):
     def hardening(self) -> IsotropicHardening:
         """Return yield stress and hardening with their values at the quadrature points. Collective.
 
-        Raises:
-            InputError: A value does not fit; the message names it.
+        Raise an InputError where a value does not fit; the message names it.
         """
         values = {}
         for name, value in self._at_points.items():
@@ -346,11 +343,7 @@ class J2Plasticity(Plasticity):
 
 
 def check_law(elasticity: Any, u: Any, name: str) -> None:
-    """Raise unless a law fits a displacement.
-
-    Raises:
-        InputError: It names what does not fit.
-    """
+    """Raise unless a law fits a displacement."""
     checked_type(elasticity, Elasticity, "elasticity", "a tfeti_dolfinx.Elasticity")
     checked_type(u, fem.Function, "u", "a dolfinx.fem.Function")
     if elasticity.model == "plane_stress":

@@ -248,11 +248,7 @@ class NonlinearContactProblem(ContactProblem):
         return "smaller load steps"
 
     def _check_rotations(self) -> None:
-        """Raise if F takes a rotation for a stretch, as strains of small strain do. Collective.
-
-        Raises:
-            InputError: It does.
-        """
+        """Raise if F takes a rotation for a stretch, as strains of small strain do. Collective."""
         u, forms = np.array(self.u.x.array), self._newton_forms
         c, s = np.cos(self._tolerances.turned) - 1.0, np.sin(self._tolerances.turned)
         moved, gdim, found = fem.Function(self.u.function_space), len(self.u), list[Array]()
@@ -456,11 +452,7 @@ class NonlinearContactProblem(ContactProblem):
 
 
 def check_gaps(contacts: Sequence[ContactPartner]) -> None:
-    """Raise if a contact in finite strain has a given gap, which no place would change.
-
-    Raises:
-        InputError: It names the contact.
-    """
+    """Raise if a contact in finite strain has a given gap, which no place would change."""
     for contact in checked_contacts(contacts):
         if not isinstance(contact.gap, str):
             raise InputError(

@@ -33,14 +33,14 @@ class LawVariables(dict[fem.Function, NewValue]):
 class InternalVariables:
     """Internal variables with what gives their values at the end of a step. Collective.
 
+    Creation raises an InputError where a function or its new value does not fit; the message names
+    it.
+
     Args:
         given: For each function on the torn mesh (a quadrature or discontinuous space) a UFL
             expression of its new value, in terms of the displacement and of old values, or a
             callable without arguments that returns the new ``x.array``.
         mesh: The torn mesh.
-
-    Raises:
-        InputError: A function or its new value does not fit; the message names it.
     """
 
     def __init__(self, given: Mapping[fem.Function, NewValue], mesh: Any) -> None:
@@ -93,8 +93,7 @@ class InternalVariables:
     def commit(self) -> None:
         """Take the values at the end of a step: all are evaluated before any is set. Collective.
 
-        Raises:
-            InputError: A value is not finite, or a callable fails. Nothing has changed.
+        Raise an InputError where a value is not finite, or a callable fails. Nothing has changed.
         """
         found = []
         with raised_on_all_ranks(self._comm):
@@ -111,11 +110,7 @@ class InternalVariables:
 
 
 def check_state(update: Any, state: Any) -> None:
-    """Raise if of a material either ``update`` or ``state`` is given, and not the other.
-
-    Raises:
-        InputError: It names the material and its variables.
-    """
+    """Raise if of a material either ``update`` or ``state`` is given, and not the other."""
     if update is None and isinstance(state, LawVariables):
         name = type(state.law).__name__
         raise InputError(

@@ -54,11 +54,9 @@ SLIDES = (
 def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
     """Return options with the solver, preconditioner and friction that ``auto`` stands for.
 
-    ``rows`` are the numbers of normal and of tangential rows of contacts, on all ranks.
-
-    Raises:
-        InputError: The scene has inequalities or friction, but a solver that does not keep them
-            is asked for; or a preconditioner with a solver that takes none.
+    ``rows`` are the numbers of normal and of tangential rows of contacts, on all ranks. Raise an
+    InputError where the scene has inequalities or friction, but a solver that does not keep them is
+    asked for; or a preconditioner with a solver that takes none.
     """
     qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
@@ -187,9 +185,7 @@ def conclude(
 
     ``excluding`` are names of the contacts whose rows exclude each other, ``restless`` is the body
     on which bounds of friction change most, and whether it slides; an error says ``warnings``, too.
-
-    Raises:
-        ConvergenceError: It stopped before its tolerance, unless options turn that off.
+    Raise a ConvergenceError where it stopped before its tolerance, unless options turn that off.
     """
     contacts = f", those of {' and '.join(excluding)}" if excluding else ""
     body, slides = restless

@@ -90,14 +90,13 @@ class Checkpoint:
 
     The folder is the checkpoint's own. ``checkpoint.json`` marks it before anything else is
     written; it says of which steps and ranks there are files, and only those are ever removed.
+    Creation raises an InputError where the path is no folder for a checkpoint, or its index is
+    damaged.
 
     Args:
         path: The folder; it may be there if it is empty or has a checkpoint, and nothing else.
         comm: Communicator.
         subdomains: Those of this rank, ascending.
-
-    Raises:
-        InputError: The path is no folder for a checkpoint, or its index is damaged.
     """
 
     def __init__(
@@ -178,6 +177,8 @@ class Checkpoint:
     ) -> None:
         """Keep a step; the one before is replaced when this one is whole.
 
+        Raise an InputError where the files cannot be written.
+
         Args:
             number: How many steps have converged.
             about: What else to keep of it, for JSON; rank 0's counts.
@@ -186,9 +187,6 @@ class Checkpoint:
             fields: Fields of the step on this rank, kept for all steps.
             digest: Describes all that the user has given at this step, for JSON; empty where it
                 is not known. ``read`` gives it back. Rank 0's counts.
-
-        Raises:
-            InputError: The files cannot be written.
         """
         comm, in_state, in_fields = self._comm, "", ""
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):

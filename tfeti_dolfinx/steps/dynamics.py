@@ -137,6 +137,9 @@ class Predictor:
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
         """Return the nearest displacement to w.
 
+        Raise a ConvergenceError where the solver stopped before its tolerance; a FactorError where
+        M could not be factored.
+
         Args:
             w: Displacement in DOLFINx's order.
             M: This rank's mass in DOLFINx's order; factors are kept while it is the same object.
@@ -144,10 +147,6 @@ class Predictor:
 
         Returns:
             A displacement in DOLFINx's order.
-
-        Raises:
-            ConvergenceError: The solver stopped before its tolerance.
-            FactorError: M could not be factored.
         """
         dofs, constraints = self._dofs, gluing.constraints
         before, primal = np.array(constraints.c), dofs.to_primal(w)
@@ -529,11 +528,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
 
 
 def check_guided(contacts: Sequence[ContactPartner]) -> None:
-    """Raise if a rigid body has free motions, for which a step would need its mass.
-
-    Raises:
-        InputError: It names the contact.
-    """
+    """Raise if a rigid body has free motions, for which a step would need its mass."""
     for contact in checked_contacts(contacts):
         shape = getattr(contact, "shape", None)
         if isinstance(shape, RigidBody) and shape.free:

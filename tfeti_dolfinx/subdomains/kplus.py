@@ -51,12 +51,9 @@ MakeInverse = Callable[[Any, Array, Array, str], GeneralisedInverse]
 def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> CholeskyFactor:
     """Factor K_ρ = K + ρ Nᵀ(NNᵀ)⁻¹N, N the kernel on a few fixing unknowns, ρ = max diag K.
 
-    K_ρ⁻¹ is an exact generalised inverse, because N R is regular
-    (Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos, IJNME 88, 2011, section 4).
-
-    Raises:
-        NotPositiveDefiniteError: K_ρ has no Cholesky factor.
-        FactorError: It could not be made for another reason.
+    K_ρ⁻¹ is an exact generalised inverse, because N R is regular (Brzobohatý, Dostál, Kozubek,
+    Kovář, Markopoulos, IJNME 88, 2011, section 4). Raise a NotPositiveDefiniteError where K_ρ has
+    no Cholesky factor; a FactorError where it could not be made for another reason.
     """
     return CholeskyFactor(regular_matrix(K, R, fixing_dofs), prefix)
 
@@ -98,8 +95,7 @@ class InverseFactory:
 def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) -> str:
     """Say what is wrong with a stiffness whose K_ρ has no Cholesky factor, or a useless one.
 
-    Raises:
-        FactorError: It could not be found out, say for want of memory.
+    Raise a FactorError where it could not be found out, say for want of memory.
     """
     diagonal, rigid = K.diagonal(), R.shape[1]
     shifted = regular_matrix(K, R, fixing_dofs) + diags_array(TOLERANCES.rounding * diagonal)
@@ -130,9 +126,6 @@ def check_rank(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> None:
     """Raise if K⁺ blows up a motion that is not rigid and that K gives no energy.
 
     Pivots that should be 0 are positive where rounding makes them so. It takes one solve.
-
-    Raises:
-        NotPositiveDefiniteError: It does.
     """
     R = _with_weakly_held(K, R, x)
     force = _beside(R, np.random.default_rng(0).standard_normal(K.shape[0]))

@@ -40,7 +40,9 @@ from tfeti_dolfinx.subdomains.kplus import (
 class Stiffness:
     """K, its kernel, its generalised inverse, and what it is on traces.
 
-    Equal subdomains share one; it lives as long as one of them uses it.
+    Equal subdomains share one; it lives as long as one of them uses it. Creation raises an
+    InputError where K is not symmetric, not finite or not positive semidefinite; a FactorError
+    where a factor could not be made.
 
     Args:
         name: Name for messages.
@@ -53,10 +55,6 @@ class Stiffness:
         kernel: R, shape ``(n, r)``.
         diagonal: Diagonal of K.
         entries: Entries of the factor; of an inverse that the user brings, as if it were dense.
-
-    Raises:
-        InputError: K is not symmetric, not finite or not positive semidefinite.
-        FactorError: A factor could not be made.
     """
 
     def __init__(self, name: str, x: Array, K: Any, how: InverseFactory) -> None:
@@ -212,9 +210,7 @@ class EqualSubdomains:
     def find(self, name: str, x: Array, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness that is equal to K, or a new one; and where K's unknowns are in it.
 
-        Raises:
-            InputError: K does not fit.
-            FactorError: A factor could not be made.
+        Raise an InputError where K does not fit; a FactorError where a factor could not be made.
         """
         bs = K.shape[0] // len(x)
         shape, nodes = places_in_order(x)
@@ -261,8 +257,10 @@ def _equal(K: Any, other: Stiffness, here: Array) -> bool:
 class SparseBlock(Block):
     """Block of a sparse stiffness: factors of K_ρ and, when asked for, of K_ii.
 
-    They belong to its stiffness, which it may share with Blocks that are equal to it. The
-    numbering of the stiffness is that of the first of them.
+    They belong to its stiffness, which it may share with Blocks that are equal to it. The numbering
+    of the stiffness is that of the first of them. Creation raises an InputError where K is not
+    symmetric, not finite or not positive semidefinite, or the load is not finite; a FactorError
+    where a factor could not be made.
 
     Args:
         data: The subdomain.
@@ -272,11 +270,6 @@ class SparseBlock(Block):
     Attributes:
         equals: As given.
         place: Unknown of the stiffness for each of its own, shape ``(n,)``.
-
-    Raises:
-        InputError: K is not symmetric, not finite or not positive semidefinite, or the load is
-            not finite.
-        FactorError: A factor could not be made.
     """
 
     def __init__(
