@@ -51,9 +51,6 @@ def raised_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     Collective. The block itself must not communicate after a point where a rank may raise.
     The exception of the lowest rank that has one is raised everywhere, of the same type: one that
     cannot travel is a TfetiError that names it, on its own rank too.
-
-    Args:
-        comm: The communicator whose ranks all enter the block.
     """
     error: Exception | None = None
     try:

@@ -49,10 +49,7 @@ def labels_of_cells(decomposition: Decomposition) -> Array:
 def labels_of_dofs(dofmap: Array, count: int, decomposition: Decomposition) -> Array:
     """Return labels of what cells share: in the order of the first cell, and of places in it.
 
-    Args:
-        dofmap: Dofs, or points, of each cell, shape ``(cells, k)``; no two subdomains share one.
-        count: Their number on this rank.
-        decomposition: The decomposition.
+    ``dofmap`` has dofs, or points, of each cell, shape ``(cells, k)``; no two subdomains share one.
     """
     ids = decomposition.original_cells
     order = np.argsort(-ids)  # the first cell writes last

@@ -324,11 +324,7 @@ class System:
 
         Raise an InputError where Dirichlet values, contacts, stiffness or load do not fit; a
         NoSolutionError where the problem has no solution; a FactorError where a matrix could not be
-        factored.
-
-        Args:
-            last: Name of the stage.
-            seconds: Takes the seconds of each stage.
+        factored. ``seconds`` takes the seconds of each stage.
         """
         for name, (timed_as, make) in STAGES.items():
             if name in self._stale:

@@ -60,8 +60,7 @@ def flatness(mesh: dmesh.Mesh) -> Array:
 def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
     """Return pairs of bodies with nodes in common, and how many; the same on all ranks. Collective.
 
-    Returns:
-        The pairs, shape ``(p, 2)``, and the numbers, shape ``(p,)``.
+    Shapes ``(p, 2)`` and ``(p,)``.
     """
     comm, mesh = decomposition.comm, decomposition.mesh
     if decomposition.num_bodies == 1:

@@ -323,9 +323,7 @@ def _functions(value: Any) -> list[Any]:
 def check_same_problem(kept: Mapping[str, Any], found: Mapping[str, Any]) -> None:
     """Raise an InputError, which names the first difference, unless two problems are the same.
 
-    Args:
-        kept: What ``ContactProblem.digest`` returned in an earlier run, the same on all ranks.
-        found: What it returns here, at the same place of the series.
+    Both are what ``ContactProblem.digest`` returns at the same place of a series.
     """
     if (different := difference(dict(found), dict(kept))) is not None:
         what, now, before = different

@@ -94,11 +94,8 @@ def rows_over(comm: MPI.Intracomm, own: Any) -> Entries:
 class Exchange:
     """Rows that travel to other ranks, and answers that travel back.
 
-    The communication pattern is found once; any number of arrays may follow it.
-
-    Args:
-        comm: Communicator. The constructor and both methods are collective.
-        destination: Rank that each row goes to, shape ``(n,)``.
+    The communication pattern is found once; any number of arrays may follow it. Creation, with the
+    rank that each row goes to, and both methods are collective.
 
     Attributes:
         source: Rank that each received row comes from, shape ``(m,)``, ascending.

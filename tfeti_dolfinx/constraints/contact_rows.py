@@ -19,14 +19,8 @@ class RowBuilder:
 
     A coefficient a becomes a·w/Σw on each torn copy, w its weight in D (a/k on k copies of equal
     weight): so rows are orthogonal to the gluing rows in the inner product of D⁻¹. Prescribed
-    components are left to the right side.
-
-    Args:
-        dofs: Dof maps.
-        flag: Which components of the owned groups are prescribed, shape ``(g, bs)``.
-        weights: D for each copy of the owned groups, shape ``(c, bs)``.
-        records: Conditions of this rank.
-        rigid: What unknowns of rigid bodies add to them; their columns are the last ones.
+    components are left to the right side. D and flags of prescribed components are those of copies
+    and of owned groups, shapes ``(c, bs)`` and ``(g, bs)``.
     """
 
     def __init__(

@@ -143,12 +143,8 @@ class Multipliers:
 class ContactState:
     """Displacement, multipliers, and what follows for the contact conditions of this rank.
 
-    Args:
-        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-        multipliers: Multipliers of this rank's rows.
-        gluing: Rows and contact records.
-        contacts: Obstacles and pairs, the secondary surface of a pair first.
-        thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
+    u is in primal order, shape ``(num_nodes * bs,)``; areas are multiplied by the thickness, a
+    number or a scalar in UFL.
 
     Attributes:
         finite: Whether forces act at X + u, as in finite strain.

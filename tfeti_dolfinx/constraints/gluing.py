@@ -287,16 +287,10 @@ class Gluing:
     def right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Array:
         """This rank's part of c for any prescribed values, gaps and slips; B stays. Collective.
 
-        Raise a NoSolutionError where prescribed components alone violate a condition.
-
-        Args:
-            values: Prescribed values of the owned groups, shape ``(g, bs)``; what stands at
-                components that are not prescribed has no effect.
-            gaps: Gap of each condition of the records, a length, shape ``(n,)``.
-            slip: Where the load step begins, as the attribute; default that.
-
-        Returns:
-            Shape ``(num_rows,)``, for ``Constraints.c``.
+        Raise a NoSolutionError where prescribed components alone violate a condition. Values are of
+        owned groups, shape ``(g, bs)``, and have no effect on components that are not prescribed;
+        gaps, lengths, of the conditions; slips as the attribute, default that. Shape
+        ``(num_rows,)``.
         """
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
@@ -375,8 +369,7 @@ class Gluing:
     def contacts_of(self, rows: Array) -> list[int]:
         """Positions, in the user's list, of the contacts that some local rows are of. Collective.
 
-        Args:
-            rows: Local rows; equalities among them belong to no contact.
+        Equalities among them belong to none.
         """
         sets = self.constraints.sets
         normals = self.contact.condition[np.isin(sets.normals, rows)]
@@ -402,18 +395,9 @@ def glue(
     """Rows of interfaces, Dirichlet conditions and contacts, and their right sides. Collective.
 
     Raise a NoSolutionError where Dirichlet conditions and contacts contradict each other; an
-    InputError where a rigid body with free motions meets nodes that are prescribed.
-
-    Args:
-        dofs: Dof maps.
-        prescribed: Dirichlet values.
-        records: Contact conditions of this rank; those within reach get rows.
-        length: A length of the scene.
-        weights: D, positive, one per local primal unknown: the stiffness there, or ones. Rows
-            are orthonormal in the inner product of D⁻¹ as far as they can be.
-        slip: Where the load step begins: the tangential v_i of all conditions then, shape
-            ``(n, gdim - 1)``; default 0.
-        tools: Rigid bodies with free motions, if there are any.
+    InputError where a rigid body with free motions meets nodes that are prescribed. Records within
+    reach get rows. D is positive, one for each local primal unknown, the stiffness there, or ones:
+    rows are orthonormal in the inner product of D⁻¹ as far as they can be.
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
     rigid = tools.entries(records) if tools else None

@@ -163,8 +163,7 @@ class Constraints:
     def with_pressures(self, pressures: Array) -> Constraints:
         """Return the same rows with the ψ_i = μ_i λ_N,i of Coulomb's law; ∞ sticks.
 
-        Args:
-            pressures: λ_N of each of ``pressed``.
+        λ_N are those of ``pressed``.
         """
         at, limits = self.pressed, self.limits.copy()
         mu = self.coefficients[at]

@@ -27,11 +27,8 @@ MOTIONS = {2: ("x", "y", "rz"), 3: ("x", "y", "z", "rz", "ry", "rx")}
 def motion_fields(arm: Array) -> Array:
     """Return the displacements of points by unit translations and small unit turns.
 
-    Args:
-        arm: Points from the centre of the turns, shape ``(n, gdim)``.
-
-    Returns:
-        In the order of ``MOTIONS``, shape ``(n, k, gdim)``.
+    Points are counted from the centre of the turns, shape ``(n, gdim)``. In the order of
+    ``MOTIONS``, shape ``(n, k, gdim)``.
     """
     n, gdim = arm.shape
     fields = np.zeros((n, len(MOTIONS[gdim]), gdim))

@@ -224,17 +224,10 @@ def check_placement(
 ) -> None:
     """Raise if a shape is not one of this dimension, or its gradient not that of its distance.
 
-    Collective. The gradient is compared with central differences of the distance at a few points
-    of each rank: it is wrong where they differ by more than 60° or a factor of 100, since it may be
-    rounded off or of any length. Wrong are most of them, or none.
-
-    Args:
-        shape: The shape.
-        x: Points of the surface on this rank, shape ``(n, gdim)``.
-        gdim: Dimension of the space.
-        what: Begins messages.
-        size: Length of the scene.
-        comm: Communicator.
+    Collective. The gradient is compared with central differences of the distance at a few points of
+    each rank: it is wrong where they differ by more than 60° or a factor of 100, since it may be
+    rounded off or of any length. Wrong are most of them, or none. Points are those of the surface
+    on this rank, shape ``(n, gdim)``; the size is that of the scene.
     """
     if callable(check := getattr(shape, "check_dimension", None)):
         check(gdim, what)

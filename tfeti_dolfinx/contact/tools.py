@@ -44,11 +44,7 @@ class Tools:
 
     They have one unknown for each free motion, a length: of a turn, its angle times the size of the
     surface. All of them are on the last rank, behind the unknowns of its nodes. Creation raises an
-    InputError where bodies do not fit the space, or two have the same name.
-
-    Args:
-        contacts: Obstacles and pairs.
-        dofs: Dof maps. The constructor is collective.
+    InputError where bodies do not fit the space, or two have the same name. Creation is collective.
 
     Attributes:
         bodies: The bodies, with their names.
@@ -191,8 +187,7 @@ class Tools:
     def take(self, values: Array) -> None:
         """Take the unknowns of a solution, those of this rank. Collective.
 
-        Args:
-            values: Shape ``(num_local,)``.
+        Shape ``(num_local,)``.
         """
         if self.num_unknowns:
             values = self._comm.bcast(values, root=self._comm.size - 1)
@@ -202,9 +197,7 @@ class Tools:
     def motion(self, records: ContactRecords, found: bool = False) -> Array:
         """Return displacements of bodies at conditions, shape ``(n, gdim)``; 0 without a body.
 
-        Args:
-            records: The conditions.
-            found: Whether free motions of the last solve count.
+        ``found``: free motions of the last solve count, too.
         """
         steps = self.steps() + (self.found if found else 0.0)
         motion = self.motion_there(records)
@@ -261,8 +254,7 @@ class Tools:
     def check_nodes(self, contact: Array) -> None:
         """Raise if conditions with free motions have nothing but prescribed unknowns. Collective.
 
-        Args:
-            contact: Contact of each such condition on this rank.
+        Given are their contacts on this rank.
         """
         wrong = np.zeros(len(self.of_contact))
         wrong[contact] = 1.0

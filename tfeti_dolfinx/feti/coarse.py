@@ -161,14 +161,9 @@ class CoarseSpace(Coarse):
         """Return motions of a space that rows do not resist.
 
         The null space of Gᵀ lives on the bodies' motions: one that no gluing row resists is the
-        same in all subdomains of a body. Found on one rank: processors that round differently
-        might count differently.
-
-        Args:
-            rows: Flags of local rows.
-            within: The space, default ``unheld``.
-            below: Motions of a single body that are held by less than this share of what the
-                same rows hold at most are taken in, too.
+        same in all subdomains of a body. Found on one rank: processors that round differently might
+        count differently. ``rows`` are flags of local rows, the space is by default ``unheld``,
+        ``below`` as of ``rigid_bodies.unresisted``.
         """
         grams = self.comm.gather(gram_of(self.J, rows, self.bodies.count, self.bodies.k), root=0)
         found: Any = None

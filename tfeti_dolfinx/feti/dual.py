@@ -267,8 +267,7 @@ class Dual:
     def qp(self, norm_steps: int = 0) -> QP:
         """Return the quadratic program; without kernel it has no coarse problem.
 
-        Args:
-            norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
+        ‖PFP‖ is estimated once, by so many Lanczos steps; 0 where nobody asks for it.
         """
         self.feasible = self.law(self.constraints)  # c may be another, and what the law refers to
         if norm_steps and norm_steps not in self._norms:

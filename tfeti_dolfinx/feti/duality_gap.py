@@ -36,14 +36,8 @@ def energy_bound(
     which is at least ½‖v − u*‖²_K + ½‖u − u*‖²_K (Prager, Synge, Q. Appl. Math. 5, 1947). All terms
     are differences already: nothing cancels. v closes on the trace what rows miss, and is extended
     harmonically: ‖v − u‖²_K is δᵀSδ. It costs one multiplication by S, and one solve in each
-    subdomain more where λ does not balance the load.
-
-    Args:
-        dual: The dual problem.
-        lam: The multipliers λ ∈ Ω on this rank.
-        u: The displacement K⁺(f − Bᵀλ) + Rα on this rank, shape ``(n,)``.
-        norm: ‖F‖, or an estimate; 0 where there is none.
-        balanced: Worst entry of Gλ − e beside its terms from which on the forces are balanced.
+    subdomain more where λ does not balance the load. ``norm`` is ‖F‖, or an estimate, or 0;
+    ``balanced`` the worst entry of Gλ − e beside its terms from which on the forces are balanced.
     """
     forces, displacement, apart = _balanced(dual, lam, u, norm, balanced)
     if not np.isfinite(apart):

@@ -87,12 +87,7 @@ def measure(
        error of u in energy, as far as λ balances the load.
     3. Sizes and energies of u, of its elastic part and of v, body by body.
 
-    Args:
-        dual: The dual problem.
-        state: The displacement, recovered.
-        face: The face of λ.
-        norm: ‖F‖, or an estimate.
-        before: The displacement of an earlier iterate.
+    ``norm`` is ‖F‖, or an estimate; ``before`` the displacement of an earlier iterate.
     """
     # 1. what rows miss
     constraints, sets, comm = dual.constraints, dual.constraints.sets, dual.coarse.comm
@@ -309,10 +304,8 @@ class Accuracy(StoppingRule):
         """Measure the iterate of the last look with another set of multipliers. Collective.
 
         Bounds of friction that a solve was given are not those of its forces. What the last look
-        has seen stays the least of the errors.
-
-        Returns:
-            Whether it is right to the tolerance with that set, too.
+        has seen stays the least of the errors. Return whether it is right to the tolerance with
+        that set, too.
         """
         self._least = self.errors()
         self.look(lam, gradient, face, residual)
@@ -331,8 +324,7 @@ class Accuracy(StoppingRule):
     def errors(self, changes: bool = True) -> Array:
         """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``.
 
-        Args:
-            changes: Whether what has changed since the look before it counts.
+        ``changes``: what has changed since the look before it counts.
         """
         now, before = self.measures, self._before if changes else None
         energy = np.sqrt(np.maximum(now.energies, 0.0))

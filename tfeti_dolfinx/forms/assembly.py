@@ -52,14 +52,6 @@ class Forms:
     Creation raises an InputError where a form cannot be integrated on the torn mesh, or not be
     compiled.
 
-    Args:
-        a: Bilinear form.
-        L: Linear form.
-        V: The space of a.
-        decomposition: The torn mesh.
-        form_compiler_options: As in DOLFINx.
-        jit_options: As in DOLFINx.
-
     Attributes:
         names: Those of the bilinear and the linear form, for messages.
         given: The forms as they were given, by their names.

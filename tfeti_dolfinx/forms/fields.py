@@ -68,14 +68,8 @@ def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
 class Freezable:
     """A UFL expression whose constants and functions, but for one, can be kept as they are.
 
-    The mesh is no function: where it is moved, the expression moves along.
-
-    Args:
-        expression: The expression.
-        u: The function in it that it is a function of, or None.
-
-    Attributes:
-        expression: The expression.
+    The mesh is no function: where it is moved, the expression moves along. u is the function in it
+    that it is a function of, or None.
     """
 
     def __init__(self, expression: Any, u: fem.Function | None = None) -> None:

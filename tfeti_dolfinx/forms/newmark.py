@@ -156,9 +156,7 @@ class Inertia:
 class InertialForms(Forms):
     """The matrix and the load of a step. Creation and all methods are collective.
 
-    Args:
-        mass: Bilinear form of the mass M.
-        as_forms: Arguments of ``Forms``; L is the load as it is at the end of the step.
+    The arguments are those of ``Forms``; L is the load as it is at the end of the step.
 
     Attributes:
         inertia: M, and where the step begins.

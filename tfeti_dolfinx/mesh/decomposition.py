@@ -26,12 +26,9 @@ from tfeti_dolfinx.mesh.untorn import PhysicalNames
 class CellExchange:
     """Rows of values that travel between the cells of two meshes. All is collective.
 
-    The torn mesh has the cells of the one before on other ranks and in another order, but each
-    with its vertices in the same order: a reference cell's points are those of the other's.
-
-    Args:
-        untorn: The mesh that was decomposed.
-        ids: For each cell of the torn mesh the original id, shape ``(n,)``.
+    The torn mesh has the cells of the one before on other ranks and in another order, but each with
+    its vertices in the same order: a reference cell's points are those of the other's. ``ids`` are
+    the original ids of the cells of the torn mesh, shape ``(n,)``.
     """
 
     def __init__(self, untorn: dmesh.Mesh, ids: Array) -> None:

@@ -62,11 +62,9 @@ def connected_parts(pieces: Pieces, absorb: bool) -> tuple[Array, dict[int, list
     """Give each subdomain one piece, from the pieces of subdomains that may have several.
 
     ``absorb`` lets smaller pieces of a subdomain join the neighbour they share most facets with.
-    Pieces that stay get ids after the last, in the order of their subdomains.
-
-    Returns:
-        The subdomain of each piece, for each that was split its ids, and the body of each
-        subdomain: what hangs together by facets, numbered by their lowest subdomains.
+    Pieces that stay get ids after the last, in the order of their subdomains. Return the subdomain
+    of each piece, for each that was split its ids, and the body of each subdomain: what hangs
+    together by facets, numbered by their lowest subdomains.
     """
     subdomain = np.array(pieces.colour)
     settled = np.ones(len(subdomain), dtype=bool)

@@ -124,10 +124,7 @@ def balanced_kmeans(
     doi:10.1145/3225058.3225148). It is below the distance to the next centre: beyond that a small
     part, whose influence grows until it has points enough, soon has those of all around it. Cells
     stay where they are: sums travel. The keys, ``(n,)``, draw a sample, whose bisection is the
-    beginning.
-
-    Returns:
-        The part of each point, and how slender those of the bisection are.
+    beginning. Return the part of each point, and how slender those of the bisection are.
     """
     home = np.repeat(np.arange(len(shares)), shares)
     total, (n, gdim) = int(_counts(comm, body, len(shares)).sum()), x.shape

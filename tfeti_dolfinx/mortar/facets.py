@@ -37,10 +37,7 @@ FACET_OF = {
 class FacetElement:
     """Lagrange element of a degree on a facet, vertices first.
 
-    Args:
-        facet: interval, triangle or quadrilateral.
-        degree: Polynomial degree.
-        variant: basix' Lagrange variant.
+    The facet is an interval, triangle or quadrilateral; the variant is one of basix.
     """
 
     def __init__(self, facet: str, degree: int, variant: Any) -> None:
@@ -197,8 +194,7 @@ def local_facets(dofs: TornDofs, facets: Array) -> Facets:
 def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array]:
     """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
-    Returns:
-        The facets, and the averaged normal of each owned group, 0 off them, shape ``(g, gdim)``.
+    Return the averaged normal of each owned group, too, 0 off them, shape ``(g, gdim)``.
     """
     groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
     averaged = _unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
@@ -262,8 +258,7 @@ def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
 def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, Array, Array]:
     """Quadrature points of whole facets.
 
-    Returns:
-        Facet of each point, reference coordinates of shape ``(m, tdim)``, weights.
+    Return the facet of each point, reference coordinates of shape ``(m, tdim)``, weights.
     """
     xi, w = basix.make_quadrature(getattr(basix.CellType, kind.facet), degree)
     n, q = len(facets), len(w)

@@ -206,10 +206,7 @@ class _Return:
 
         With e in principal axes it is Σ (∂τ_a/∂ε_b + κ) e_aa e_bb − Σ τ_a e_aa² beside, for a ≠ b,
         ((τ_a − τ_b)(b_a + b_b)/(b_a − b_b) − (τ_a + τ_b)/2) e_ab², τ with its mean κ ln J.
-
-        Args:
-            kappa: Bulk moduli, shape (n,).
-            dilatation: ln J, shape (n,).
+        ``kappa`` are bulk moduli, ``dilatation`` is ln J.
         """
         diagonal, shear = self._moduli()
         tau = self.share[:, None] * self.s + (kappa * dilatation)[:, None]

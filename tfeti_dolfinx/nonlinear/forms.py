@@ -151,12 +151,7 @@ class InertialNewtonForms(NewtonForms):
 
 
 class CurrentPlaces:
-    """The places X + u of a mesh and of its nodes. Creation and ``move`` are collective.
-
-    Args:
-        u: The displacement.
-        dofs: Its dof maps, whose nodes move, too.
-    """
+    """The places X + u of a mesh and of its nodes. Creation and ``move`` are collective."""
 
     def __init__(self, u: fem.Function, dofs: TornDofs) -> None:
         V = u.function_space

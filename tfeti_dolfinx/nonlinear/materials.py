@@ -82,13 +82,9 @@ class IsotropicHardening:
     def returned(self, q: Array, G: Array, p: Array) -> tuple[Array, Array, bool]:
         """Solve q − 3G Δp = σ_y(p + Δp) where q is beyond the yield stress.
 
-        Args:
-            q: Von Mises' trial stress.
-            G: Shear modulus.
-            p: Accumulated plastic strain where the load step began.
-
-        Returns:
-            Δp, 0 where a point is elastic, the slope of σ_y at p + Δp, and whether all is solved.
+        q is von Mises' trial stress, p the accumulated plastic strain where the load step began.
+        Return Δp, 0 where a point is elastic, the slope of σ_y at p + Δp, and whether all is
+        solved.
         """
         tol, dp = self.tolerances, np.zeros_like(q)
         plastic = q > (1.0 + tol.yielding) * self.at(p)[0]

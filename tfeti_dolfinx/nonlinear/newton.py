@@ -94,10 +94,6 @@ class ModelKeeping:
 
     That is J with its factors, and in finite strain the rows of the same places, too.
 
-    Args:
-        tolerances: Those of Newton's method.
-        finite: Whether strains are finite.
-
     Attributes:
         kept: Whether the present model is that of the linearised problem before.
         before: Size of the last increment.
@@ -134,12 +130,7 @@ class ModelKeeping:
 
 
 class Anderson:
-    """Anderson's acceleration of u ← u + d: the last differences of d in least squares.
-
-    Args:
-        tolerances: Those of Newton's method.
-        comm: Communicator.
-    """
+    """Anderson's acceleration of u ← u + d: the last differences of d in least squares."""
 
     def __init__(self, tolerances: NewtonTolerances, comm: MPI.Intracomm) -> None:
         self._depth, self._rcond, self._comm = tolerances.anderson, tolerances.dependent, comm

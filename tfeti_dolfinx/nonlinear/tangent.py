@@ -16,12 +16,7 @@ from tfeti_dolfinx.errors import InputError
 
 
 class GradientReplaced(MultiFunction):  # type: ignore[misc]
-    """Replace ∇v in a residual by a tensor, and v itself, as body forces have it, by 0.
-
-    Args:
-        v: The test function of the residual.
-        gradient: What ∇v becomes.
-    """
+    """Replace ∇v in a residual by a tensor, and v itself, as body forces have it, by 0."""
 
     def __init__(self, v: Any, gradient: Any) -> None:
         super().__init__()

@@ -121,13 +121,11 @@ def newton_on_law(
 ) -> tuple[LawPoint | None, int]:
     """Solve the natural map of Coulomb's law by a semismooth Newton method. Collective.
 
-    Alart, Curnier, Comput. Methods Appl. Mech. Engrg. 92 (1991); Hüeber, Stadler, Wohlmuth, SIAM
-    J. Sci. Comput. 30 (2008). A step multiplies by F once for the way onto its face, if that can be
-    seen, and once for each direction of its solve. It may fail: have something else to try.
-
-    Returns:
-        Where the residual, ‖F‖ times what is missed, has come down to ``target``, None if it gave
-        up; and the steps taken.
+    Alart, Curnier, Comput. Methods Appl. Mech. Engrg. 92 (1991); Hüeber, Stadler, Wohlmuth, SIAM J.
+    Sci. Comput. 30 (2008). A step multiplies by F once for the way onto its face, if that can be
+    seen, and once for each direction of its solve. It may fail: have something else to try. Return
+    where the residual, ‖F‖ times what is missed, has come down to ``target``, None if it gave up;
+    and the steps taken.
     """
     best, idle, past = np.inf, 0, list[float]()
     for step in range(parameters.max_steps):
@@ -178,16 +176,8 @@ def follow_friction(
     bounded, so that it leads on to the whole coefficients (Allgower, Georg, Introduction to
     Numerical Continuation Methods, 2003, chapter 11). The share grows by twice the last step, by a
     quarter of it where Newton's method fails; it gives up where the path turns back. Collective.
-
-    Args:
-        program: The law.
-        at: Where to start.
-        target: As of ``newton_on_law``, at the end.
-        loose: The same on the way.
-        parameters: Parameters.
-
-    Returns:
-        Where it has ended, None if it gave up; and the steps taken.
+    ``target`` is as of ``newton_on_law``, at the end, ``loose`` the same on the way. Return where
+    it has ended, None if it gave up; and the steps taken.
     """
     exact = replace(parameters, reduction=parameters.path_reduction)
     short = replace(exact, max_steps=parameters.path_steps)
@@ -354,12 +344,10 @@ def known_on(
 ) -> Array:
     """Return known products Au = P(F(I + C)u + κu) from directions WN = (I + C)U of past solves.
 
-    Farhat, Crivelli, Roux (``Recycled``); as Carvalho, Gratton, Lago, Vasseur, SIAM J. Sci.
-    Comput. 33 (2011) 2463–2490 begin residuals. What others leave of an image, less than ``new`` of
-    the largest, is rounding. Multiplies by nothing. Collective.
-
-    Returns:
-        AU, orthonormal, U, and FWN combined likewise, as rows, shape ``(3, k, m)``.
+    Farhat, Crivelli, Roux (``Recycled``); as Carvalho, Gratton, Lago, Vasseur, SIAM J. Sci. Comput.
+    33 (2011) 2463–2490 begin residuals. What others leave of an image, less than ``new`` of the
+    largest, is rounding. Multiplies by nothing. Collective. Return AU, orthonormal, U, and FWN
+    combined likewise, as rows, shape ``(3, k, m)``.
     """
     nothing = np.zeros((3, 0, len(on.p)))
     if past is None or past.count == 0:

@@ -75,10 +75,8 @@ def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
 
     On the face Zt is free, and the cost of P_Ω(x + Zt) is gᵀZt + ½tᵀ(ZᵀAZ + diag κ)t to second
     order. The residual is brought down to ``reduction``, or as far as t stays in the face.
-    Multiplies by A once more than there are steps.
-
-    Returns:
-        The conjugate gradient steps; 0 where little of β is tangential, or the cost does not fall.
+    Multiplies by A once more than there are steps. Return the conjugate gradient steps; 0 where
+    little of β is tangential, or the cost does not fall.
     """
     x, g, comm, face = state.x, state.g, state.comm, state.feasible.face(state.x, state.g)
     Z, kappa, inside = face.Z, face.bends, face.status != Status.SLIP

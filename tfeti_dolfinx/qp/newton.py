@@ -327,14 +327,9 @@ class FaceSolver:
     ) -> tuple[Point, bool]:
         """Step 3: solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
-        Args:
-            start: A feasible point of the face.
-            face: The face.
-            optimality: ‖g^P‖ there.
-            resume: Whether PCPG has stopped at ``start``: it goes on if the face stays.
-
-        Returns:
-            Where PCPG ended on the last face, and whether that is in Ω and fulfils Gλ = e.
+        ‖g^P‖ is that at the start, a feasible point of the face; ``resume``: PCPG has stopped
+        there, and goes on if the face stays. Return where PCPG ended on the last face, and whether
+        that is in Ω and fulfils Gλ = e.
         """
         z, stays = start, self._enter(face) and resume
         while True:

@@ -289,14 +289,8 @@ class StoppingRule:
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Examine an iterate whose residuals are small. Collective.
 
-        Args:
-            lam: The multipliers λ.
-            gradient: Fλ − d up to the range of Gᵀ.
-            face: The face of λ: which rows carry a force.
-            residual: max(‖g^P‖, ‖F‖‖Qx‖).
-
-        Returns:
-            Why to stop, or ITERATING; then ``tolerance`` is below ``residual``.
+        ``gradient`` is Fλ − d up to the range of Gᵀ, ``residual`` max(‖g^P‖, ‖F‖‖Qx‖). Return why
+        to stop, or ITERATING; then ``tolerance`` is below ``residual``.
         """
         small = residual <= self.tolerance
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING

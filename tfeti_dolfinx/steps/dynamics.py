@@ -48,11 +48,6 @@ def balance(
 ) -> dict[str, float]:
     """Energies at the end of a step, and the work that has changed them. Collective.
 
-    Args:
-        forms: Where the step began.
-        dual: Its dual problem.
-        solution: Its end.
-
     Returns:
         ``size`` of the step; at its end ``kinetic``, ``elastic`` and ``energy``; work of the
         ``load``, of normal forces of ``contact``, of ``friction``, of ``supports`` (Dirichlet
@@ -99,10 +94,6 @@ class Predictor:
     where w has them they may overlap, though nothing does at the end. Creation and all methods are
     collective.
 
-    Args:
-        dofs: Dof maps.
-        settings: How to solve.
-
     Attributes:
         rows_and_start: Rows, and their multipliers that the next call starts from; None at first.
         image: F of these of a restored state, if it is known.
@@ -138,15 +129,8 @@ class Predictor:
         """Return the nearest displacement to w.
 
         Raise a ConvergenceError where the solver stopped before its tolerance; a FactorError where
-        M could not be factored.
-
-        Args:
-            w: Displacement in DOLFINx's order.
-            M: This rank's mass in DOLFINx's order; factors are kept while it is the same object.
-            gluing: Rows and their right sides, which are as before afterwards.
-
-        Returns:
-            A displacement in DOLFINx's order.
+        M could not be factored. w is in DOLFINx's order, as is this rank's mass M, whose factors
+        are kept while it is the same object; right sides of the rows are as before afterwards.
         """
         dofs, constraints = self._dofs, gluing.constraints
         before, primal = np.array(constraints.c), dofs.to_primal(w)

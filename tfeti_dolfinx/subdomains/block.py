@@ -240,11 +240,7 @@ class Block:
 class RigidBlock(Block):
     """A rigid body. K = 0 and R = I: it adds nothing to F, and its motions to G.
 
-    Args:
-        name: Name for messages.
-        load: Force on each unknown, shape ``(n,)``.
-        mode: Candidate mode of a body that each unknown is, shape ``(n,)``.
-        num_modes: Number of candidate modes.
+    Load and mode are those of each unknown, shape ``(n,)``.
     """
 
     def __init__(self, name: str, load: Array, mode: Array, num_modes: int) -> None:

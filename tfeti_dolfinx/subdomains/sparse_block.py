@@ -42,13 +42,7 @@ class Stiffness:
 
     Equal subdomains share one; it lives as long as one of them uses it. Creation raises an
     InputError where K is not symmetric, not finite or not positive semidefinite; a FactorError
-    where a factor could not be made.
-
-    Args:
-        name: Name for messages.
-        x: Points of the nodes.
-        K: scipy CSR, shape ``(n, n)``; becomes its own.
-        how: How inverses are made.
+    where a factor could not be made. K is scipy CSR, shape ``(n, n)``, and becomes its own.
 
     Attributes:
         K: The stiffness.
