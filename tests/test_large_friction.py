@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bodies import drawn, two_body_problem
 from dolfinx import fem
-from reference.friction import ClampedLaw
+from reference.untorn import on_plane, untorn_box
 from scenes import clamp, decomposed, displacement
 
 import tfeti_dolfinx as tfeti
@@ -42,19 +42,21 @@ def steps(cell, n, subdomains, mu, accepts, clamped, loaded, gap, loads, **optio
     )
     bcs = lambda V: [clamp(V, d.facets(clamped))]  # noqa: E731
     p = two_body_problem(d, drawn(d, loaded, t), bcs, [floor], **options)
-    law, reports = ClampedLaw(cell, n, mu, clamped, loaded, gap), []
+    untorn = untorn_box(cell, n, np.zeros(gdim), (clamped,), loaded=loaded)
+    frame, units = np.vstack((-up, np.eye(gdim)[:-1])), untorn.loads(loaded)
+    law, reports = on_plane(untorn, [mu] * (gdim - 1), frame, gap, coulomb=True), []
     for load in loads:
         t.value[:] = load
         p.solve()
         u, reported = displacement(p)[1], p.report.residuals["displacement_error"]
-        error = law.distance(u, load)
+        error = law.distance(u, units @ load)
         assert error <= FACTOR * max(reported, ROUNDING), (load, error, reported)
         right = p.report.converged_reason == "CONVERGED_RTOL"
         assert right == (reported <= p.report.tolerances["displacement_error"])
         reports.append((p.report.converged_reason, error))
         if accepts:
             p.accept()
-            law.rest(u)
+            law.accept(u)
     p.destroy()
     return reports
 

@@ -5,7 +5,7 @@ import pytest
 from bodies import boxes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.friction import on_each_other, on_plane, parts
+from reference import untorn
 from scenes import clamp, decomposed, displacement, forms, hooke, problem
 
 import tfeti_dolfinx as tfeti
@@ -67,9 +67,10 @@ def on_the_plane(
     p.solve()
     frame = frame_of(gdim, angle, -1.0)
     both = np.resize(bounds, gdim - 1)
-    coulomb = kind is tfeti.Coulomb
-    found = on_plane(cell, n, traction, both, frame, gap, coulomb=coulomb)
-    status, _ = compare(p, *found, frame, share)
+    scene = untorn.untorn_box(cell, n, traction)
+    met = untorn.on_plane(scene, both, frame, gap, kind is tfeti.Coulomb)
+    u, x = met.solve(), scene.x[scene.side("bottom")[0]]
+    status, _ = compare(p, u, x, met.force, frame, share)
     return p, status
 
 
@@ -123,7 +124,7 @@ def two_boxes(
     cell, n, subdomains, traction, bounds, angle, secondary, kind=tfeti.Tresca, share=1e-7, **more
 ):
     gdim, apart = (2 if cell in ("triangle", "quadrilateral") else 3), 0.05
-    mesh, tags, names = boxes(cell, parts(gdim, n, apart))
+    mesh, tags, names = boxes(cell, untorn.parts(gdim, n, n, apart))
     d = tfeti.decompose(mesh, max(subdomains, 2), facet_tags=tags, surfaces=names)
     V, a, L = forms(d.mesh, d.facet_tags, traction, d.surface("upper top"))
     clamped = ("lower bottom", "upper left")
@@ -140,8 +141,12 @@ def two_boxes(
     p = tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=options)
     p.solve()
     frame, both = frame_of(gdim, angle, 1.0), np.resize(bounds, gdim - 1)
-    coulomb = kind is tfeti.Coulomb
-    u, x, force = on_each_other(cell, n, traction, both, frame, apart, clamped, coulomb)
+    scene, coulomb = untorn.two_boxes(cell, traction, clamped, n, n, apart), kind is tfeti.Coulomb
+    (below, area), (above, _) = scene.side("lower top"), scene.side("upper bottom")
+    entries = [{int(a): 1.0, int(b): -1.0} for a, b in zip(below, above, strict=True)]
+    axes = (np.ones_like(area) if coulomb else area)[:, None] * both
+    met = untorn.Conditions(scene, entries, 0.0, axes, frame, coulomb)
+    u, x, force = met.solve(), scene.x[below], met.force
     if secondary == "upper bottom":
         x, force = x + apart * np.eye(3)[gdim - 1], -force
     compare(p, u, x, force, frame, share)

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from bodies import boxes, drawn, held, stacked, two_body_problem
 from dolfinx import fem
-from mpi4py import MPI
-from reference.friction import Untorn, in_ellipses
-from scenes import box, clamp, decomposed, displacement, forms, hooke
+from reference.untorn import on_plane, untorn_box
+from scenes import clamp, decomposed, displacement, forms, hooke
 
 import tfeti_dolfinx as tfeti
 
@@ -65,79 +64,14 @@ class Reference:
 
     def __init__(self, cell, kind, friction, gap):
         held, loaded = KINDS[kind]
-        mesh, tags, names = box(cell, SIZES[cell][0], MPI.COMM_SELF)
-        gdim = mesh.geometry.dim
-        scenes = [Untorn(mesh, tags, names, {loaded: axis}, (held,)) for axis in np.eye(gdim)]
-        scene, self.gdim = scenes[0], gdim
-        self.loads = np.stack([scene.f for scene in scenes], axis=1)
-        self.order, self.free = scene.order, scene.free
-        self.fixed = np.setdiff1d(np.arange(len(scene.f)), self.free)
-        K = scene.K.toarray()
-        self.inverse = np.linalg.inv(K[np.ix_(self.free, self.free)])
-        self.held = K[np.ix_(self.free, self.fixed)]
-        self.coulomb = friction in ("coulomb", "orthotropic")
-        nodes, area = scene.side("bottom")
-        kept = ~np.isin(nodes * gdim, self.fixed)
-        nodes, area = nodes[kept], area[kept]
-        _, axes, frame = law(friction, gdim)
-        n = len(nodes)
-        self.B = np.zeros((n * gdim, len(scene.f)))
-        for k in range(gdim):
-            for j in range(gdim):
-                self.B[np.arange(n) + n * k, nodes * gdim + j] = frame[k, j]
-        self.F = self.B[:, self.free] @ self.inverse @ self.B[:, self.free].T
-        self.places = np.arange(n, n * gdim).reshape(gdim - 1, n).T
-        self.axes = np.outer(np.ones(n) if self.coulomb else area, axes)
-        self.gap, self.n = np.full(n, gap), n
-        self.begin = np.zeros(n * gdim)  # what slips count from
-        self._by_node = (self.order[:, None] * gdim + np.arange(gdim)).ravel()
+        d = 3 if cell in ("tetrahedron", "hexahedron") else 2
+        scene = untorn_box(cell, SIZES[cell][0], np.zeros(d), (held,), loaded=loaded)
+        _, axes, frame = law(friction, d)
+        coulomb = friction in ("coulomb", "orthotropic")
+        self.loads, self.met = scene.loads(loaded), on_plane(scene, axes, frame, gap, coulomb)
 
-    def accept(self, u):
-        """Let slips count from displacements of the nodes, sorted by point; what sticks stays."""
-        end = self.B[:, self._by_node] @ u.ravel()
-        limits = self.axes * (self.lam[: self.n, None] if self.coulomb else 1.0)
-        share = np.sum((self.lam[self.places] / np.maximum(limits, 1e-300)) ** 2, axis=1)
-        inside = share < 1.0 - 1e-6  # not what slips, on its limit up to rounding
-        moved = self.places[~inside | np.all(self.lam[self.places] == 0.0, axis=1)].ravel()
-        self.begin[moved] = end[moved]
-
-    def solve(self, traction, value=None):
-        u = np.zeros(len(self.order) * self.gdim)
-        u[self.fixed] = np.tile(np.zeros(self.gdim) if value is None else value, len(self.fixed))[
-            : len(self.fixed)
-        ]
-        f = (self.loads @ traction)[self.free] - self.held @ u[self.fixed]
-        c = self.begin.copy()
-        c[: self.n] += self.gap
-        d = self.B[:, self.free] @ (self.inverse @ f) - c
-        lam = self.lam = self._forces(d)
-        u[self.free] = self.inverse @ (f - self.B[:, self.free].T @ lam)
-        return u.reshape(-1, self.gdim)[self.order]
-
-    def _brought(self, lam, d, r):
-        step = lam - r * (self.F @ lam - d)
-        new = np.concatenate((np.maximum(step[: self.n], 0.0), np.zeros(len(d) - self.n)))
-        axes = self.axes * (new[: self.n, None] if self.coulomb else 1.0)
-        new[self.places] = in_ellipses(step[self.places], axes)
-        return new
-
-    def _forces(self, d):
-        """λ = P(λ − r(Fλ − d)): Newton's method, and steps of the map where that does not help."""
-        lam, r = np.zeros(len(d)), 1.0 / np.linalg.norm(self.F, 2)
-        for _ in range(2000):
-            for _ in range(50):
-                lam = self._brought(lam, d, r)
-            miss = self._brought(lam, d, r) - lam
-            left = np.linalg.norm(miss)
-            if left <= 1e-14 * np.linalg.norm(lam):
-                return lam
-            h = 1e-7 * np.linalg.norm(lam)
-            ways = h * np.eye(len(d))
-            slopes = [(self._brought(lam + x, d, r) - lam - x - miss) / h for x in ways]
-            step = np.linalg.lstsq(np.stack(slopes, axis=1), -miss, rcond=None)[0]
-            if np.linalg.norm(self._brought(lam + step, d, r) - lam - step) < 0.5 * left:
-                lam = lam + step
-        raise AssertionError("the reference did not settle")
+    def solve(self, traction, value):
+        return self.met.solve(self.loads @ traction, value)
 
 
 def path(rng, gdim, kind):
@@ -192,7 +126,7 @@ def follow(seed, qp_type="newton", cells=tuple(SIZES), laws=LAWS):
         most = max(most, size)
         if accepts:
             scene.problem.accept()
-            other.accept(u)
+            other.met.accept(u)
     scene.problem.destroy()
     return wrong
 

@@ -1,16 +1,10 @@
-"""Two boxes of rectangles by an untorn mesh, mortar integrals in closed form, active set."""
+"""Two boxes of rectangles by an untorn mesh, mortar integrals in closed form."""
 
 from itertools import pairwise
 
 import numpy as np
-import ufl
-from bodies import boxes
-from dolfinx import fem
-from mpi4py import MPI
-from scenes import hooke, strain
-from scipy.sparse import csr_matrix
 
-from reference.active_set import primal_active_set
+from reference.untorn import Conditions, two_boxes
 
 
 def mortar_1d(secondary, primary):
@@ -31,66 +25,30 @@ def mortar_1d(secondary, primary):
     return D, M
 
 
-class TwoBoxes:
-    """The lever of ``test_mortar`` on one rank: [0, 1]^d−1 × [−1, 0] below [0, 1]^d."""
-
-    def __init__(self, cell, n_lower, n_upper, push, pull, secondary="upper"):
-        gdim = 2 if cell == "quadrilateral" else 3
-        self.gdim = gdim
-        flat = (0.0,) * (gdim - 1), (1.0,) * (gdim - 1)
-        parts = [
-            ("lower", flat[0] + (-1.0,), flat[1] + (0.0,), (n_lower,) * gdim),
-            ("upper", flat[0] + (0.0,), flat[1] + (1.0,), (n_upper,) * gdim),
-        ]
-        mesh, tags, names = boxes(cell, parts, MPI.COMM_SELF)
-        V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        degree = {"quadrature_degree": 2}
-        dx = ufl.Measure("dx", domain=mesh, metadata=degree)
-        ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags, metadata=degree)
-        x = ufl.SpatialCoordinate(mesh)
-        a = ufl.inner(hooke()(u), strain(v)) * dx
-        L = (pull - (pull + push) * x[0]) * v[gdim - 1] * ds(names["upper top"])
-        self.K = csr_matrix(fem.assemble_matrix(fem.form(a), block_mode=None).to_scipy())
-        self.f = fem.assemble_vector(fem.form(L)).array.copy()
-
-        def nodes(side):
-            return fem.locate_dofs_topological(V, gdim - 1, tags.find(names[side]))
-
-        self.x = V.tabulate_dof_coordinates()
-        fixed = np.concatenate((nodes("lower bottom"), nodes("upper left")))
-        self.fixed = np.unique(fixed[:, None] * gdim + np.arange(gdim))
-        self.secondary = self._sorted(nodes("upper bottom"))
-        self.primary = self._sorted(nodes("lower top"))
-        self.n, self.down = (n_upper, n_lower), 1.0
-        if secondary == "lower":
-            self.secondary, self.primary = self.primary, self.secondary
-            self.n, self.down = (n_lower, n_upper), -1.0
-
-    def _sorted(self, nodes):
-        return nodes[np.lexsort(np.rint(self.x[nodes].T * 1e7))]
-
-    def solve(self):
-        """Points and displacement of all nodes, points and forces of the secondary nodes."""
-        D, M = mortar_1d(*(np.linspace(0, 1, n + 1) for n in self.n))
-        if self.gdim == 3:  # nodes sorted by y, then x
-            D, M = np.kron(D, D), np.kron(M, M)
-        N = np.zeros((len(D), self.K.shape[0]))
-        last = self.gdim - 1
-        N[np.arange(len(D)), self.secondary * self.gdim + last] = -self.down * D
-        N[:, self.primary * self.gdim + last] += self.down * M
-        free = np.setdiff1d(np.arange(self.K.shape[0]), self.fixed)
-        held = np.abs(N[:, free]).sum(axis=1) > 0
-        rows = np.flatnonzero(held)
-        scale = np.linalg.norm(N[rows], axis=1)
-        u, force = primal_active_set(
-            self.K[free][:, free],
-            self.f[free],
-            csr_matrix(N[rows][:, free] / scale[:, None]),
-            np.zeros(len(rows)),
-        )
-        full, lam = np.zeros(self.K.shape[0]), np.zeros(len(D))
-        full[free], lam[rows] = u, force / scale * D[rows]
-        order = np.lexsort(np.rint(self.x.T * 1e7))
-        u = full.reshape(-1, self.gdim)[order]
-        return self.x[order], u, self.x[self.secondary], lam
+def lever(cell, n_lower, n_upper, push, pull, secondary):
+    """The lever of ``test_mortar``: points and displacements of its nodes, those of the secondary
+    side, and their forces."""
+    gdim = 2 if cell == "quadrilateral" else 3
+    scene = two_boxes(
+        cell,
+        lambda x: (*(0.0,) * (gdim - 1), pull - (pull + push) * x[0]),
+        ("lower bottom", "upper left"),
+        n_lower,
+        n_upper,
+    )
+    sides, n = ["upper bottom", "lower top"], [n_upper, n_lower]
+    down = -1.0 if secondary == "upper" else 1.0
+    if secondary == "lower":
+        sides, n = sides[::-1], n[::-1]
+    own, others = (scene.side(name)[0] for name in sides)
+    D, M = mortar_1d(*(np.linspace(0, 1, k + 1) for k in n))
+    if gdim == 3:  # nodes sorted by y, then x
+        D, M = np.kron(D, D), np.kron(M, M)
+    entries = [
+        {int(node): D[i], **{int(other): -M[i, j] for j, other in enumerate(others)}}
+        for i, node in enumerate(own)
+    ]
+    frame = np.vstack((down * np.eye(gdim)[-1], np.eye(gdim)[:-1]))
+    met = Conditions(scene, entries, 0.0, np.zeros(gdim - 1), frame)
+    u = met.solve()
+    return scene.x[scene.order], u, scene.x[own], met.force[:, 0] * D
