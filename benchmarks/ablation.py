@@ -1,5 +1,7 @@
 """Worth of each mechanism: what user scenes cost, and answer, without it.
 
+    ./run python3 -m benchmarks.ablation [--quick] [--only SCENE ...] [--mechanisms NAME ...]
+
 A mechanism stays in the core only if at least two scenes need a tenth more multiplications without
 it, or fail.
 """
@@ -13,19 +15,14 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
-
-import petsc4py
-
-petsc4py.init(sys.argv)
 
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from benchmarks.stability_scenes import LADDERS
 from benchmarks.stress.judge import run_scene
-from benchmarks.tools import ROOT, Tables, command_line, markdown, write_tables
+from benchmarks.tools import ROOT, Tables, command_line, finish, say
 from tfeti_dolfinx import ContactProblem
 from tfeti_dolfinx.options import MECHANISMS
 
@@ -58,9 +55,6 @@ SCENES = {
     "moduli of cells 1 : 1e6": "ladder cells, hexahedron, 1e6",
 }
 QUICK = ("semicoercive", "talk's Hertz")
-PAGE = ROOT / "docs" / "developers" / "ablation.md"
-# what may change by rounding, of u; and what costs too much, of the multiplications
-SAME, DEARER = 1e-4, 1.1
 
 
 @dataclass
@@ -128,54 +122,27 @@ def compared(counts: Counts, whole: Counts) -> tuple[str, str]:
     return ", ".join(failed) if failed else ratio, f"{change:.0e}"
 
 
-def main(argv: list[str]) -> Tables:
-    """Run all scenes without each mechanism, write the page; returns the tables."""
-    arguments, _ = command_line(__doc__, argv, configure)
-    names = arguments.only or (QUICK if arguments.quick else tuple(SCENES))
-    mechanisms = arguments.mechanisms or tuple(MECHANISMS)
-    ratios: list[dict[str, Any]] = []
-    changes: list[dict[str, Any]] = []
-    for name in names:
-        whole = run(SCENES[name], "")
-        row = {"scene": name, "F + S": f"{whole.F} + {whole.S}"}
-        found = {m: compared(run(SCENES[name], m), whole) for m in mechanisms}
-        ratios.append(row | {m: cost for m, (cost, _) in found.items()})
-        changes.append(row | {m: change for m, (_, change) in found.items()})
-        print(markdown(ratios[-1:]).splitlines()[-1], flush=True)
-    tables = {"Multiplications": ratios, "Change of u": changes}
-    write_tables(arguments.output, "ablation", tables)
-    if arguments.page:
-        arguments.page.write_text(page(tables), encoding="utf-8")
-    return tables
-
-
 def configure(parser: Any) -> None:
     """Arguments of this benchmark."""
     parser.add_argument("--only", nargs="+", choices=tuple(SCENES), help="scenes")
     parser.add_argument("--mechanisms", nargs="+", choices=tuple(MECHANISMS))
-    parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help="write the page, too")
 
 
-def page(tables: Tables) -> str:
-    """Return the generated page of the documents."""
-    named = "\n".join(f"* `{name}`: {text}" for name, text in MECHANISMS.items())
-    return f"""# What each mechanism is worth
-
-Written by `./run python3 -m benchmarks.ablation --page`. Each column is a run with
-`-tfeti_without NAME`: multiplications by F and S over those with all mechanisms, or why the solver
-or the demo has stopped. A mechanism stays if two scenes at least need a tenth more without it,
-or fail.
-
-{named}
-
-## Multiplications
-
-{markdown(tables["Multiplications"])}
-
-## Change of ‖u‖
-
-{markdown(tables["Change of u"])}
-"""
+def main(argv: list[str]) -> Tables:
+    """Run all scenes without each mechanism; returns the tables."""
+    arguments, _ = command_line(__doc__, argv, configure)
+    names = arguments.only or (QUICK if arguments.quick else tuple(SCENES))
+    mechanisms = arguments.mechanisms or tuple(MECHANISMS)
+    tables: Tables = {"Multiplications": [], "Change of u": []}
+    for name in names:
+        whole = run(SCENES[name], "")
+        row = {"scene": name, "F + S": f"{whole.F} + {whole.S}"}
+        found = {m: compared(run(SCENES[name], m), whole) for m in mechanisms}
+        tables["Multiplications"].append(row | {m: cost for m, (cost, _) in found.items()})
+        tables["Change of u"].append(row | {m: change for m, (_, change) in found.items()})
+        say(tables["Multiplications"][-1])
+    tables["Mechanisms"] = [{"name": f"`{m}`", "what": MECHANISMS[m]} for m in mechanisms]
+    return finish(arguments, "ablation", tables)
 
 
 if __name__ == "__main__":

@@ -12,11 +12,6 @@ from __future__ import annotations
 import sys
 from bisect import bisect_left
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -230,7 +225,7 @@ def main(argv):
     arguments, _ = command_line(__doc__, argv)
     sizes = ((2, 2), (3, 2)) if arguments.quick else ((2, 16), (3, 4))
     tables = dict(study(gdim, n) for gdim, n in sizes)
-    return finish(arguments, "kplus_forms", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "kplus_forms", tables, draw)
 
 
 if __name__ == "__main__":

@@ -20,11 +20,6 @@ import time
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -362,7 +357,7 @@ def main(argv):
         rows, report = study(name, SIZES[size][name], options, repeats, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"
         tables[f"{name}: {sizes}, {comm.size} ranks, {unit}"] = with_ratios(rows)
-    return finish(arguments, "linear_price", tables, draw, comm.rank)
+    return finish(arguments, "linear_price", tables, draw)
 
 
 if __name__ == "__main__":

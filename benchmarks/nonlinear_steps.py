@@ -10,11 +10,6 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 import numpy as np
 from mpi4py import MPI
 

@@ -6,8 +6,8 @@ Cubes of few cells, on more ranks than there are cores: nothing is timed. ranks.
 programs and MPI and counts every call of more than one rank, PETSc's and DOLFINx's, too. A step of
 conjugate gradients is what 7 of them on a face send more than 2. Arrays are those that can be
 reached from the problem after a solve. Beside the counts is a model: one subdomain a rank, formulas
-that are compared with what is counted, run to 10 648 ranks. Results go to results/ranks.md, .json
-and .png.
+that are compared with what is counted, run to 10 648 ranks. Results go to results/ranks.md and
+.json.
 """
 
 from __future__ import annotations
@@ -24,18 +24,13 @@ from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array, eye_array, kron
 
 import tfeti_dolfinx as tfeti
 import tfeti_dolfinx.problem
-from benchmarks.tools import ROOT, SHOWN, command_line, curves, finish, picture
+from benchmarks.tools import FILE, command_line, finish, json_of
 from demos import scene
 from tfeti_dolfinx.feti.preconditioner import PARAMETERS
 from tfeti_dolfinx.qp.krylov import pcpg
@@ -164,11 +159,8 @@ def model(q, clusters=0, kept=(FEW + MORE - 1) / 2):
 def factor_entries(q):
     """Entries of the factor of a matrix with a full block for each pair of q³ cubes that touch."""
     line = csr_array(np.abs(np.subtract.outer(np.arange(q), np.arange(q))) <= 1, dtype=float)
-    touching = kron(kron(line, line), line)
-    A = kron(touching, np.ones((6, 6))) + 200 * eye_array(6 * q**3)
-    factor = CholeskyFactor(csr_array(A))
-    entries = factor.entries
-    return round(entries)
+    A = kron(kron(kron(line, line), line), np.ones((6, 6))) + 200 * eye_array(6 * q**3)
+    return round(CholeskyFactor(csr_array(A)).entries)
 
 
 # --- Runs and tables ------------------------------------------------------------------------------
@@ -176,16 +168,10 @@ def factor_entries(q):
 
 def counted(library, ranks, subdomains, clusters=0):
     """What the ranks of a run have found."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "found.json"
-        program = [sys.executable, __file__, "--worker", file, subdomains, clusters]
-        words = ["mpirun", "-n", ranks, "env", f"LD_PRELOAD={library}", *program]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        done = subprocess.run([*map(str, words)], capture_output=True, text=True, env=environment)
-        if not file.exists():
-            raise RuntimeError("\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:]))
-        print(ranks, "ranks,", subdomains, "subdomains,", clusters or "no", "clusters", flush=True)
-        return json.loads(file.read_text())
+    program = [sys.executable, __file__, "--worker", FILE, subdomains, clusters]
+    found = json_of(["env", f"LD_PRELOAD={library}", *program], ranks)
+    print(ranks, "ranks,", subdomains, "subdomains,", clusters or "no", "clusters", flush=True)
+    return found
 
 
 def row(found, clusters=0, of=np.max):
@@ -217,28 +203,13 @@ def growing(few, many, ratio):
                 table.append((path.removeprefix("._system._dual."), *kB))
             else:
                 smaller += kB
-    table = [*sorted(table, key=lambda line: -line[2]), ("smaller ones", *smaller)]
-    names = (f"kB, {len(found)} ranks" for found in (few, many))
-    names = "array", *names
-    return [dict(zip(names, map(plain, line), strict=True)) for line in table]
-
-
-def plain(value):
-    return value if isinstance(value, str) else float(value)
+    table = [*sorted(table, key=lambda line: -line[2]), ("smaller ones", *map(float, smaller))]
+    names = ("array", *(f"kB, {len(found)} ranks" for found in (few, many)))
+    return [dict(zip(names, line, strict=True)) for line in table]
 
 
 def configure(parser):
     parser.add_argument("--ranks", nargs="+", type=int, default=[1, 2, 4, 8, 16, 32])
-
-
-def draw(path, tables):
-    """What a step sends over the ranks of the model."""
-    with picture(path, 1) as (panel,):
-        rows = [row for row in tables["model"] if row["clusters"] == "none"]
-        x = [row["ranks"] for row in rows]
-        names = "kB in them", "kB in messages", "entries of L"
-        lines = {name: (x, [row[name] for row in rows]) for name in names}
-        curves(panel, "a subdomain a rank", ("ranks", ""), lines)
 
 
 def main(argv):
@@ -268,7 +239,7 @@ def main(argv):
         tables["growing"] = growing(run(1, few), run(8, many), 8.0)
     edges = (2, 3) if quick else (4, 8, 16, 22)
     tables["model"] = [model(q) for q in edges] + [model(q, (q // 2) ** 3) for q in edges]
-    return finish(arguments, "ranks", tables, draw)
+    return finish(arguments, "ranks", tables)
 
 
 if __name__ == "__main__":

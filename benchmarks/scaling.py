@@ -19,7 +19,6 @@ Results go to results/scaling_weak.md, .json and .png, and so on.
 
 from __future__ import annotations
 
-import subprocess
 import sys
 
 from benchmarks.tools import (
@@ -32,6 +31,7 @@ from benchmarks.tools import (
     picture,
     solve_seconds,
     stage_seconds,
+    started,
 )
 
 NEWTON = ["-tfeti_qp_type", "newton"]
@@ -78,8 +78,7 @@ if comm.rank == 0:
 
 def bandwidth(ranks):
     """GB/s between memory and so many ranks together, the best of ten runs."""
-    words = ["mpirun", "-n", str(ranks), sys.executable, "-c", TRIAD]
-    return float(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
+    return float(started([sys.executable, "-c", TRIAD], ranks))
 
 
 def costs(report):

@@ -13,7 +13,7 @@ direct solution. Where rounding of the stiffness alone changes that by more than
 be right to rtol: such solves are in a table of their own. A profile ρ(τ) is the share of solves
 that a solver ends for at most τ times the cost of the best one (Mathematical Programming 91, 2002):
 cost in multiplications by F and by the preconditioner, and in seconds of the solver. Results go to
-results/solver_profiles.md, .json and .png.
+results/solver_profiles.md and .json.
 """
 
 from __future__ import annotations
@@ -26,11 +26,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 import numpy as np
 from mpi4py import MPI
 
@@ -42,7 +37,7 @@ from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Answer, Untorn
 from benchmarks.stress.scene import Scene
 from benchmarks.stress.solve import UnsettledError
-from benchmarks.tools import choose_clock, command_line, configure_clock, finish, picture
+from benchmarks.tools import choose_clock, command_line, configure_clock, finish
 
 PRECONDITIONERS = ("none", "lumped", "dirichlet")
 CONTACT = [*(("newton", pc) for pc in PRECONDITIONERS), ("smalse", "none")]
@@ -243,23 +238,6 @@ def _beside_best(row: dict[str, Any]) -> dict[str, Any]:
     return {}
 
 
-def draw(path, tables):
-    """The profiles as steps."""
-    shown = {title: rows for title, rows in tables.items() if "τ = 1" in rows[0]}
-    with picture(path, len(shown)) as axes:
-        for panel, (title, rows) in zip(axes, shown.items(), strict=True):
-            for row in rows:
-                panel.step(
-                    TAUS, [row[f"τ = {tau:g}"] for tau in TAUS], where="post", label=row["solver"]
-                )
-            panel.set_xscale("log", base=2)
-            panel.set_ylim(0.0, 1.02)
-            panel.set_xlabel("τ, times the best")
-            panel.set_title(title, fontsize="medium")
-            panel.grid(alpha=0.3)
-            panel.legend(fontsize="small")
-
-
 def main(argv):
     """Solve all scenes by all solvers and write the profiles; returns the tables."""
     arguments, _ = command_line(__doc__, argv, configure)
@@ -273,7 +251,7 @@ def main(argv):
             print(name, *(row.values() for row in found), flush=True)
     logging.disable(before)
     tables = MPI.COMM_WORLD.bcast(tabled(rows, unit) if rank == 0 else None)
-    return finish(arguments, "solver_profiles", tables, draw, rank)
+    return finish(arguments, "solver_profiles", tables)
 
 
 if __name__ == "__main__":

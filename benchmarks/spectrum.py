@@ -16,11 +16,6 @@ from __future__ import annotations
 
 import sys
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -211,7 +206,7 @@ def main(argv):
         for gdim, (edges, counts) in sizes.items()
         for name, boundary in (("finite elements", False), ("boundary elements", True))
     }
-    return finish(arguments, "spectrum", tables, draw, MPI.COMM_WORLD.rank, shown)
+    return finish(arguments, "spectrum", tables, draw, shown)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ programs and active sets, with friction Alart's and Curnier's method). A row has
 
 ``F`` are multiplications by F, ``of friendly`` those over the ones of the friendly scene,
 ``error`` the largest error of a body, ``estimate`` what the report says of it. Results go to
-results/stability.md, .json and .png.
+results/stability.md and .json.
 """
 
 from __future__ import annotations
@@ -24,22 +24,16 @@ import logging
 import sys
 from typing import Any
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 from mpi4py import MPI
 
 from benchmarks.stability_scenes import CELLS, LADDERS, Ladder, label
 from benchmarks.stress.judge import run_scene
 from benchmarks.stress.scene import Scene
-from benchmarks.tools import command_line, curves, finish, picture
+from benchmarks.tools import command_line, finish, say
 
 WITHIN = 100.0  # of rtol, of the report's estimate, of the noise of the direct solution
 QUICK = ("triangle",)
 GROUPS = tuple(dict.fromkeys(ladder.group for ladder in LADDERS))
-SHOWN = {"moduli": "hexahedron", "nu": "hexahedron", "aspect": "hexahedron"}
 
 
 def configure(parser):
@@ -76,7 +70,7 @@ def climb(ladder: Ladder, cell: str, quick: bool) -> list[dict[str, Any]]:
             row |= {"error": found.get("u", "-"), "estimate": found.get("estimate", "-")}
             row["size"] = found.get("size", "-")
             row["says"] = said(found)
-            print(*row.values(), sep=" | ", flush=True)
+            say(row)
         rows.append(row)
     return rows
 
@@ -97,22 +91,6 @@ def locking(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def draw(path, tables):
-    """Multiplications over those of the friendly scene."""
-    titles = [title for title in tables if title != "locking"]
-    with picture(path, len(titles[:3])) as axes:
-        for panel, title in zip(axes, titles[:3], strict=True):
-            rows, lines = tables[title], {}
-            cell = SHOWN.get(title, rows[0]["cell"])
-            cell = cell if any(row["cell"] == cell for row in rows) else rows[0]["cell"]
-            for row in rows:
-                if row["cell"] == cell:
-                    x, y = lines.setdefault(row["scene"], ([], []))
-                    x.append(len(x))
-                    y.append(row["of friendly"])
-            curves(panel, f"{title}, {cell}", ("rung", "F, of friendly"), lines, log="")
-
-
 def main(argv):
     """Climb the ladders and write what came out; returns the tables."""
     arguments, _ = command_line(__doc__, argv, configure)
@@ -129,7 +107,7 @@ def main(argv):
     if MPI.COMM_WORLD.rank == 0 and "nu" in tables:
         tables["locking"] = locking(tables["nu"])
     tables = MPI.COMM_WORLD.bcast({title: rows for title, rows in tables.items() if rows})
-    return finish(arguments, "stability", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "stability", tables)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 Memory is what all ranks have in use when a stage ends, and what their processes hold then: what is
 freed may stay theirs (Open MPI wants it so), and is used for what comes later. Results go to
-results/stages.md, .json and .png.
+results/stages.md and .json.
 """
 
 from __future__ import annotations
@@ -13,11 +13,6 @@ import ctypes
 import sys
 from pathlib import Path
 from typing import ClassVar
-
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
 
 from mpi4py import MPI
 
@@ -28,8 +23,6 @@ from benchmarks.tools import (
     command_line,
     configure_clock,
     finish,
-    picture,
-    stacked,
 )
 from demos import petsc_options, scene
 
@@ -137,13 +130,6 @@ def configure(parser):
     configure_clock(parser)
 
 
-def draw(path, tables):
-    """Seconds of stages."""
-    with picture(path, len(tables)) as axes:
-        for panel, (title, rows) in zip(axes, tables.items(), strict=True):
-            stacked(panel, title.rpartition(",")[0], rows, ["seconds"])
-
-
 def main(argv):
     """Run the scenes and write their tables; returns them."""
     arguments, rest = command_line(__doc__, argv, configure)
@@ -153,7 +139,7 @@ def main(argv):
         report, seconds = solved(name, SIZES[size][name], petsc_options(rest))
         title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks, {unit}"
         tables[title] = stage_rows(seconds)
-    return finish(arguments, "stages", tables, draw, comm.rank)
+    return finish(arguments, "stages", tables)
 
 
 if __name__ == "__main__":

@@ -12,13 +12,6 @@ from __future__ import annotations
 
 import sys
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
-from mpi4py import MPI
-
 from benchmarks.tools import column, command_line, curves, finish, picture, solve_seconds
 from demos import run
 
@@ -139,7 +132,7 @@ def main(argv):
         title: table(demo, talk, list(talk)[:count], arguments, options)
         for title, (demo, talk) in TABLES.items()
     }
-    return finish(arguments, "talk_tables", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "talk_tables", tables, draw)
 
 
 if __name__ == "__main__":

@@ -2,219 +2,353 @@
 
     ./run python3 benchmarks/time_against_error.py [--quick] [--scenes "half ball" ...]
 
-Each scene is solved on meshes that get finer: uniform, graded by hand, and following the estimated
-error; with displacements of degree 1 and 2, the latter on curved cells, too; with triangles and
+Each scene is solved on meshes that get finer, each case in processes of its own: uniform, graded by
+hand, and following the estimated error (by the demos ``adaptive_2d.py`` and ``adaptive_3d.py``);
+with displacements of degree 1 and 2, the latter on curved cells, too; with triangles and
 quadrilaterals. ``seconds`` are from gmsh's mesh to the displacement, the best of three if short;
 gmsh's own are in ``meshing``; what is paid once, the start of the program with its imports and the
-compiling of forms, has a table of its own. ``MB`` is the peak of resident memory of all ranks.
+compiling of forms, has a table of its own: the coarsest mesh is solved once more at first. ``MB``
+is the peak of resident memory of all ranks.
 
 Errors are relative, against a fine solution of degree 2 of the same scene: ``energy`` is that of
-the stress in the energy norm, ``estimate`` what the solve itself says of it; ``J`` is the total
-energy; ``pressure`` is the L² norm inside 0.9 a; ``a`` and ``p0`` are as in benchmarks/profiles.py.
-The last column is against the closed form, which belongs to half planes and half spaces.
+the stress in the energy norm, ``estimate`` what the solve itself says of it; ``pressure`` is the L²
+norm inside 0.9 a; ``a`` and ``p0`` are as in benchmarks/pressures.py. The last column is against
+the closed form, which belongs to half planes and half spaces.
 Results go to results/time_against_error.md, .json and .png.
 """
 
 from __future__ import annotations
 
-import argparse
+import contextlib
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
+import gmsh
 import numpy as np
+import ufl
+from dolfinx import fem, geometry
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
 
-from benchmarks.error_case import QUADRILATERAL, TRIANGLE, Case
-from benchmarks.error_scenes import ADAPTIVE, SCENES, UNIFORM, Scene
-from benchmarks.profiles import errors
+import demos
+import tfeti_dolfinx as tfeti
+from benchmarks.error_scenes import ADAPTIVE, GRADED, NU, SCENES, UNIFORM, Scene
+from benchmarks.pressures import Array, errors
 from benchmarks.tools import (
-    MPI_VARIABLES,
-    ROOT,
-    SHOWN,
+    FILE,
     Tables,
     command_line,
     configure_clock,
     curves,
     finish,
+    json_of,
     picture,
     slope,
     write_tables,
 )
+from meshes.tools import element_options
 
+TRIANGLE, QUADRILATERAL = "triangle", "quadrilateral"
+# what makes gmsh mesh with them and nothing else
+CELLS = {TRIANGLE: {}, QUADRILATERAL: {"RecombineAll": 1, "RecombinationAlgorithm": 3}}
+FOLLOWED = {"half cylinder": "adaptive_2d", "half ball": "adaptive_3d"}
+# unknowns of a subdomain, in 2D and 3D
+SUBDOMAIN = {2: 2500, 3: 4000}
+# seconds up to which a solve is repeated, and how often
+SHORT, REPEATS = 3.0, 3
 LEVELS = (0.05, 0.02, 0.01)
 MEASURES = ("energy", "pressure")
+COMM = MPI.COMM_WORLD
+
+# --- Cases --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Cases of a scene.
+class Case:
+    """What is solved.
 
     Attributes:
-        cases: Groups of meshes.
-        reference: The fine solution that errors are against.
-        quick: Groups of a quick run.
-        quick_reference: Its reference.
+        scene: Its name.
+        sizes: Elements along a, or goals of the adaptive loop.
+        mesh: Uniform, graded or adaptive.
+        cell: Triangles, or quadrilaterals.
+        degree: Of displacements.
+        order: Of the cells' geometry.
+        ranks: Processes.
+        rtol: The solver's tolerance.
+        processor: Whether seconds are those of the processor, not of the wall.
     """
 
-    cases: tuple[Case, ...]
-    reference: Case
-    quick: tuple[Case, ...]
-    quick_reference: Case
+    scene: str
+    sizes: tuple[float, ...]
+    mesh: str = GRADED
+    cell: str = TRIANGLE
+    degree: int = 1
+    order: int = 1
+    ranks: int = 1
+    rtol: float | str = 1e-6
+    processor: bool = False
 
-
-def label(case: Case) -> str:
-    """A case in a few words."""
-    words = [case.mesh, "" if case.cell == TRIANGLE else "quadrilaterals", f"P{case.degree}"]
-    if case.degree == 2:
-        words.append("curved" if case.order == 2 else "straight")
-    words.append(f"{case.ranks} ranks" if case.ranks > 1 else "")
-    return " ".join(word for word in words if word)
-
-
-def case(name: str, sizes: tuple[float, ...], **other: Any) -> Case:
-    """A case of degree 1; of degree 2 on curved cells if ``order=2``."""
-    return Case(name, sizes, **other)
+    @property
+    def label(self) -> str:
+        """The case in a few words."""
+        words = [self.mesh, "" if self.cell == TRIANGLE else "quadrilaterals", f"P{self.degree}"]
+        words += ["curved" if self.order == 2 else "straight"] * (self.degree == 2)
+        words += [f"{self.ranks} ranks"] * (self.ranks > 1)
+        return " ".join(word for word in words if word)
 
 
 def both(name: str, linear: tuple[float, ...], order: int = 2, **other: Any) -> list[Case]:
     """Degree 1, and degree 2 on meshes that are twice as coarse."""
     quadratic = tuple(size / 2 for size in linear)
-    return [
-        case(name, linear, **other),
-        case(name, quadratic, degree=2, order=order, **other),
-    ]
+    return [Case(name, linear, **other), Case(name, quadratic, degree=2, order=order, **other)]
 
 
-def plan(name: str, cases: list[Case], finest: float, order: int = 2) -> Plan:
-    """A plan with its quick form: the first two groups, their two coarsest meshes."""
-    reference = case(name, (finest,), degree=2, order=order)
-    quick = tuple(replace(one, sizes=one.sizes[:2]) for one in cases[:2])
-    coarse = replace(reference, sizes=(quick[0].sizes[1],))
-    return Plan(tuple(cases), replace(reference, rtol=1e-7), quick, coarse)
+def plans() -> dict[str, tuple[list[Case], Case]]:
+    """Groups of meshes of each scene, and the fine solution that errors are against."""
+    sizes, found = (6.0, 12.0, 24.0, 48.0), {}
+
+    def plan(name: str, finest: float, order: int, *groups: list[Case]) -> None:
+        fine = Case(name, (finest,), degree=2, order=order, rtol=1e-7)
+        found[name] = [case for group in groups for case in group], fine
+
+    name = "half cylinder"
+    straight, squares = both(name, sizes, order=1)[1:], both(name, sizes, cell=QUADRILATERAL)
+    uniform = both(name, (1.0, 2.0, 4.0, 6.0), mesh=UNIFORM)
+    uniform.append(Case(name, (0.3, 0.15, 0.08, 0.04), ADAPTIVE))
+    two = both(name, sizes, ranks=2)
+    plan(name, 64.0, 2, both(name, sizes), straight, squares, uniform, two)
+
+    name, few = "half ball", (4.0, 6.0, 10.0)
+    first = [Case(name, (*few, 16.0)), both(name, few)[1]]
+    uniform = [Case(name, (0.6, 1.0, 1.5), UNIFORM), Case(name, (0.35, 0.25, 0.18), ADAPTIVE)]
+    two = [replace(case, ranks=2) for case in first]
+    plan(name, 10.0, 2, first, both(name, few, order=1)[1:], uniform, two)
+
+    for name in ("rounded punch", "partial slip"):
+        uniform, two = [Case(name, (1.0, 2.0, 4.0), UNIFORM)], both(name, sizes, order=1, ranks=2)
+        plan(name, 64.0, 1, both(name, sizes, order=1), uniform, two)
+
+    name, around = "shrink fit", (8.0, 16.0, 32.0, 64.0)
+    kinds = {}, {"cell": QUADRILATERAL}, {"ranks": 2}
+    # of no mesh a refinement: their midpoints are better
+    plan(name, 90.0, 2, *(both(name, around, mesh=UNIFORM, **kind) for kind in kinds))
+
+    name = "cylinder on block"
+    straight, squares = both(name, sizes, order=1)[1:], both(name, sizes, cell=QUADRILATERAL)
+    uniform, two = both(name, (1.0, 2.0, 4.0), mesh=UNIFORM), both(name, sizes, ranks=2)
+    plan(name, 64.0, 2, both(name, sizes), straight, squares, uniform, two)
+    return found
 
 
-def _line() -> Plan:
-    name, sizes = "half cylinder", (6.0, 12.0, 24.0, 48.0)
-    cases = both(name, sizes)
-    cases += both(name, sizes, order=1)[1:]
-    cases += both(name, sizes, cell=QUADRILATERAL)
-    cases += both(name, (1.0, 2.0, 4.0, 6.0), mesh=UNIFORM)
-    cases.append(case(name, (0.3, 0.15, 0.08, 0.04), mesh=ADAPTIVE))
-    cases += both(name, sizes, ranks=2)
-    return plan(name, cases, 64.0)
+# --- One case, in processes of its own ------------------------------------------------------------
 
 
-def _ball() -> Plan:
-    name, sizes = "half ball", (4.0, 6.0, 10.0, 16.0)
-    cases = both(name, sizes[:3])
-    cases[0] = case(name, sizes)
-    cases += both(name, sizes[:3], order=1)[1:]
-    cases.append(case(name, (0.6, 1.0, 1.5), mesh=UNIFORM))
-    cases.append(case(name, (0.35, 0.25, 0.18), mesh=ADAPTIVE))
-    cases += [replace(one, ranks=2) for one in cases[:2]]
-    return plan(name, cases, 10.0)
+@dataclass(frozen=True)
+class Solved:
+    """A problem that is solved, with what it took."""
+
+    problem: tfeti.ContactProblem
+    seconds: float
+    meshing: float
+    peak: float
 
 
-def _half_planes(name: str) -> Plan:
-    sizes = (6.0, 12.0, 24.0, 48.0)
-    cases = both(name, sizes, order=1)
-    cases.append(case(name, (1.0, 2.0, 4.0), mesh=UNIFORM))
-    cases += both(name, sizes, order=1, ranks=2)
-    return plan(name, cases, 64.0, order=1)
+def memory(clear: bool = False) -> float:
+    """Peak of resident memory of all ranks since it was cleared, where Linux can. Collective."""
+    if clear:
+        with contextlib.suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")
+    lines = Path("/proc/self/status").read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith("VmHWM"))
+    return float(COMM.allreduce(int(line.split()[1]))) / 1024
 
 
-def _rings() -> Plan:
-    name, sizes = "shrink fit", (8.0, 16.0, 32.0, 64.0)
-    cases = both(name, sizes, mesh=UNIFORM)
-    cases += both(name, sizes, mesh=UNIFORM, cell=QUADRILATERAL)
-    cases += both(name, sizes, mesh=UNIFORM, ranks=2)
-    return plan(name, cases, 90.0)  # of no mesh a refinement: their midpoints are better
+def meshed(scene: Scene, case: Case, size: float) -> tuple[Any, int]:
+    """gmsh's model on rank 0, and how many subdomains suit it."""
+    model, parts = None, 0
+    if COMM.rank == 0:
+        if gmsh.isInitialized():
+            gmsh.clear()  # models of earlier meshes
+        with element_options(ElementOrder=case.order, **CELLS[case.cell]):
+            model = scene.build(size, case.mesh)
+        dim = model.getDimension()
+        # of degree d, so many nodes for each one of degree 1
+        nodes = len(model.mesh.getNodes()[0]) * (case.degree / case.order) ** dim
+        parts = max(COMM.size, round(dim * nodes / SUBDOMAIN[dim]))
+    return model, COMM.bcast(parts)
 
 
-def _cylinder() -> Plan:
-    name, sizes = "cylinder on block", (6.0, 12.0, 24.0, 48.0)
-    cases = both(name, sizes)
-    cases += both(name, sizes, order=1)[1:]
-    cases += both(name, sizes, cell=QUADRILATERAL)
-    cases += both(name, (1.0, 2.0, 4.0), mesh=UNIFORM)
-    cases += both(name, sizes, ranks=2)
-    return plan(name, cases, 64.0)
+def solve(scene: Scene, case: Case, size: float) -> Solved:
+    """Mesh, then set up and solve by the clock: from gmsh's mesh to displacements. Collective."""
+    if case.mesh == ADAPTIVE:
+        return adapted(case, size)
+    start = time.perf_counter()
+    model, parts = meshed(scene, case, size)
+    memory(clear=True)
+    begin = time.perf_counter()
+    decomposition = tfeti.read_gmsh(model, COMM, parts)
+    made = scene.make(decomposition, case.degree)
+    problem = tfeti.ContactProblem(**made, petsc_options={"tfeti_rtol": case.rtol})
+    scene.solve(problem)
+    COMM.barrier()
+    return Solved(problem, time.perf_counter() - begin, begin - start, memory())
 
 
-PLANS = {
-    "half cylinder": _line(),
-    "half ball": _ball(),
-    "rounded punch": _half_planes("rounded punch"),
-    "partial slip": _half_planes("partial slip"),
-    "shrink fit": _rings(),
-    "cylinder on block": _cylinder(),
-}
+def adapted(case: Case, goal: float) -> Solved:
+    """All solves of a demo that follows its error, and their estimates. Collective."""
+    generate, meshing = gmsh.model.mesh.generate, [0.0]
+
+    def watched(dim: int) -> None:
+        start = time.perf_counter()
+        generate(dim)
+        meshing[0] += time.perf_counter() - start
+
+    memory(clear=True)
+    gmsh.model.mesh.generate, begin = watched, time.perf_counter()
+    try:
+        problem = demos.names_of(FOLLOWED[case.scene], ["--error", goal])["problem"]
+    finally:
+        gmsh.model.mesh.generate = generate
+    COMM.barrier()
+    spent = COMM.bcast(meshing[0])
+    return Solved(problem, time.perf_counter() - begin - spent, spent, memory())
 
 
-def configure(parser):
-    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
-    configure_clock(parser)
-    parser.add_argument("--ranks", nargs="+", type=int, default=[1, 2], help="numbers of ranks")
+def profile(scene: Scene, solution: tfeti.Solution) -> Array:
+    """The pressure at the scene's samples. Collective."""
+    data = solution.contact(0)
+    parts = COMM.allgather((scene.place(data.points), scene.force(data)))
+    points, pressure = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return scene.samples.at(points, pressure)
 
 
-def run_case(case: Case, reference: Path) -> dict[str, Any]:
-    """What a case gives, solved in processes of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "rows.json"
-        program = [sys.executable, str(ROOT / "benchmarks" / "error_case.py"), case.write()]
-        command = ["mpirun", "-n", str(case.ranks), *program, str(file), str(reference)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "LAUNCHED": str(time.time())}
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
-        if done.returncode != 0 or not file.exists():
-            said = "\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:])
-            raise RuntimeError(f"{case} failed:\n{said}")
-        found: dict[str, Any] = json.loads(file.read_text())
-        return found
+def densities(sigma: Array) -> Array:
+    """Eσ : C⁻¹σ of stresses, shape ``(n, 3, 3)``."""
+    squares = (1 + NU) * np.einsum("nij,nij->n", sigma, sigma)
+    return squares - NU * np.einsum("nii->n", sigma) ** 2
+
+
+def stresses(solution: tfeti.Solution, points: Array, cells: Array) -> Array:
+    """Stress at points of some cells of this rank."""
+    return solution.stress.eval(points, cells).reshape(-1, 3, 3)
+
+
+def write_stresses(file: Path, solution: tfeti.Solution, young: Callable[[Array], Array]) -> None:
+    """Write the stress at the midpoints of all cells, with what each counts. Collective."""
+    mesh = solution.decomposition.mesh
+    cells = np.arange(len(solution.decomposition.cell_subdomain), dtype=np.int32)
+    W = fem.functionspace(mesh, ("DG", 0))
+    points = dmesh.compute_midpoints(mesh, mesh.topology.dim, cells)
+    volumes = fem.assemble_vector(fem.form(ufl.TestFunction(W) * ufl.dx)).array
+    weights = volumes[np.asarray(W.dofmap.list)[cells, 0]]
+    found = COMM.gather((points, weights, stresses(solution, points, cells)))
+    if found is not None:
+        x, w, sigma = (np.concatenate(part) for part in zip(*found, strict=True))
+        np.savez(file, points=x, weights=w / young(x), sigma=sigma)
+
+
+def energy_error(file: Path, solution: tfeti.Solution) -> float:
+    """‖σ_h − σ‖ in energy over ‖σ‖, where the two meshes both are. Collective."""
+    mesh = solution.decomposition.mesh
+    with np.load(file) as fine:
+        points, weights, sigma = (fine[name] for name in ("points", "weights", "sigma"))
+    cells = np.arange(len(solution.decomposition.cell_subdomain), dtype=np.int32)
+    tree = geometry.bb_tree(mesh, mesh.topology.dim, entities=cells)
+    near = geometry.compute_collisions_points(tree, points)
+    hit = geometry.compute_colliding_cells(mesh, near, points)
+    inside = np.diff(hit.offsets) > 0
+    # a point between subdomains is in several ranks' cells: the first one counts it
+    first = np.where(inside, COMM.rank, COMM.size)
+    COMM.Allreduce(MPI.IN_PLACE, first, op=MPI.MIN)
+    own = np.flatnonzero(inside & (first == COMM.rank))
+    found = stresses(solution, points[own], hit.array[hit.offsets[own]])
+    error = weights[own] @ densities(found - sigma[own])
+    return float(np.sqrt(COMM.allreduce(error) / (weights @ densities(sigma))))
+
+
+def solved_row(case: Case, size: float, reference: Path) -> dict[str, Any]:
+    """The best of some solves, and what came out; writes a reference that is not there yet."""
+    scene, timed = SCENES[case.scene](), reference.exists()
+    last = solve(scene, case, size)
+    runs = [last]
+    while timed and len(runs) < REPEATS and COMM.bcast(runs[0].seconds) < SHORT:
+        last.problem.destroy()
+        last = solve(scene, case, size)
+        runs.append(last)
+    best = min(runs, key=lambda run: run.seconds)
+    problem, report = last.problem, last.problem.report
+    row = {
+        "size": size,
+        "unknowns": report.primal_dofs,
+        "seconds": best.seconds,
+        "meshing": best.meshing,
+        "MB": best.peak,
+        "F": int(report.in_all["F_multiplications"]),
+        "energy": energy_error(reference, problem.solution) if timed else None,
+        "estimate": problem.estimate().relative_discretisation,
+        "profile": profile(scene, problem.solution).tolist(),
+    }
+    if not timed:
+        write_stresses(reference, problem.solution, scene.young)
+    problem.destroy()
+    return row
+
+
+def worker(text: str, file: str, reference: Path) -> None:
+    """Solve the case of a JSON text, and write its rows. Collective."""
+    started, case, first = time.time(), Case(**json.loads(text)), None
+    if case.processor:
+        time.perf_counter = time.process_time
+    if reference.exists():  # the reference itself is not timed
+        solved = solve(SCENES[case.scene](), case, case.sizes[0])
+        solved.problem.destroy()
+        first = solved.seconds
+    rows = [solved_row(case, size, reference) for size in case.sizes]
+    once = {"start": started - float(os.environ.get("LAUNCHED", started))}
+    once["first"] = first and first - rows[0]["seconds"]
+    if COMM.rank == 0:
+        Path(file).write_text(json.dumps({"rows": rows, "once": once}))
+
+
+# --- Tables ---------------------------------------------------------------------------------------
 
 
 def compared(scene: Scene, found: dict[str, Any], best: dict[str, Any]) -> dict[str, Any]:
     """A row of the table, from what a solve gives and the reference."""
-    profile = np.array(found["profile"])
-    against = errors(scene.samples, profile, np.array(best["profile"]))
-    shown = ("size", "unknowns", "seconds", "meshing", "MB", "F")
-    closed = errors(scene.samples, profile, scene.exact)
-    return {
-        **{name: found[name] for name in shown},
-        "energy": found["energy"],
-        "estimate": found["estimate"],
-        "J": found["J"] / best["J"] - 1,
-        **against,
-        "pressure, closed form": closed["pressure"],
-    }
+    pressure = np.array(found.pop("profile"))
+    against = errors(scene.samples, pressure, np.array(best["profile"]))
+    closed = errors(scene.samples, pressure, scene.exact)
+    return {**found, **against, "pressure, closed form": closed["pressure"]}
+
+
+def between(x: Sequence[float], y: Sequence[float], at: float) -> float:
+    """y at an x, on straight lines of logarithms."""
+    order = np.argsort(x)
+    return float(np.exp(np.interp(np.log(at), np.log(x)[order], np.log(y)[order])))
 
 
 def seconds_at(rows: Sequence[dict[str, Any]], name: str, level: float) -> float | None:
     """Seconds at an error, between two meshes on straight lines of logarithms."""
     if rows[0][name] <= level:
         return float(rows[0]["seconds"])
-    for coarse, fine in pairwise(rows):
-        if fine[name] <= level < coarse[name]:
-            ends = np.log([fine[name], coarse[name]]), np.log([fine["seconds"], coarse["seconds"]])
-            return float(np.exp(np.interp(np.log(level), *ends)))
+    for ends in pairwise(rows):
+        if ends[1][name] <= level < ends[0][name]:
+            return between([e[name] for e in ends], [e["seconds"] for e in ends], level)
     return None
 
 
 def summary(case: Case, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Slopes of a group of meshes, and seconds at equal errors."""
-    made: dict[str, Any] = {"meshes": label(case)}
+    made: dict[str, Any] = {"meshes": case.label}
     for name in MEASURES:
         values = [row[name] for row in rows]
         for over in ("unknowns", "seconds"):
@@ -225,11 +359,7 @@ def summary(case: Case, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def degrees(groups: dict[str, Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Errors of degree 1 over those of degree 2 in the same time, on straight lines of logarithms.
-
-    Args:
-        groups: Rows of groups of meshes, by their names.
-    """
+    """Errors of degree 1 over those of degree 2 in the same time, by the names of groups."""
     table = []
     for name, quadratic in groups.items():
         linear = groups.get(name.replace("P2 curved", "P1").replace("P2 straight", "P1"), quadratic)
@@ -240,55 +370,51 @@ def degrees(groups: dict[str, Sequence[dict[str, Any]]]) -> list[dict[str, Any]]
         for seconds in [start, np.sqrt(start * end), end] if start < end else []:
             row = {"meshes": name, "seconds": float(seconds)}
             for measure in MEASURES:
-                one, two = (error_at(rows, measure, seconds) for rows in (linear, quadratic))
-                row[f"{measure}, P1"], row[f"{measure}, P2"] = one, two
+                one, two = (
+                    between([r["seconds"] for r in rows], [r[measure] for r in rows], seconds)
+                    for rows in (linear, quadratic)
+                )
+                row |= {f"{measure}, P1": one, f"{measure}, P2": two}
                 row[f"{measure}, P1 over P2"] = one / two
             table.append(row)
     return table
 
 
-def error_at(rows: Sequence[dict[str, Any]], name: str, seconds: float) -> float:
-    """The error that is reached in some seconds, which are within those of the rows."""
-    ordered = sorted(rows, key=lambda row: row["seconds"])
-    x, y = ([np.log(row[key]) for row in ordered] for key in ("seconds", name))
-    return float(np.exp(np.interp(np.log(seconds), x, y)))
+def run_case(case: Case, reference: Path) -> dict[str, Any]:
+    """What a case gives, solved in processes of its own."""
+    words = [sys.executable, __file__, "--worker", json.dumps(asdict(case)), FILE, reference]
+    return json_of(words, case.ranks, LAUNCHED=str(time.time()))
 
 
-def study(name: str, arguments: argparse.Namespace, folder: Path) -> Tables:
+def study(name: str, arguments: Any, folder: Path) -> Tables:
     """The tables of a scene; what its reference has goes into a folder."""
-    plan, scene, reference = PLANS[name], SCENES[name](), folder / "reference.npz"
-    finest = plan.quick_reference if arguments.quick else plan.reference
+    (cases, finest), scene, reference = plans()[name], SCENES[name](), folder / "reference.npz"
+    if arguments.quick:  # the first two groups, their two coarsest meshes
+        cases = [replace(case, sizes=case.sizes[:2]) for case in cases[:2]]
+        finest = replace(finest, sizes=cases[0].sizes[1:], rtol=1e-6)
     best = run_case(finest, reference)["rows"][-1]
     rows, groups, once, by_name = [], [], [], {}
-    for planned in plan.quick if arguments.quick else plan.cases:
-        if planned.ranks not in arguments.ranks:
-            continue
-        case = replace(planned, processor=arguments.processor)
-        found = run_case(case, reference)
-        made = [compared(scene, one, best) for one in found["rows"]]
-        rows += [{"meshes": label(case), **row} for row in made]
-        by_name[label(case)] = made
-        groups.append(summary(case, made))
-        once.append({"meshes": label(case), **found["once"]})
-        print(name, *groups[-1].values(), sep=" | ", flush=True)
+    for case in cases:
+        if case.ranks in arguments.ranks:
+            found = run_case(replace(case, processor=arguments.processor), reference)
+            made = [compared(scene, one, best) for one in found["rows"]]
+            rows += [{"meshes": case.label, **row} for row in made]
+            by_name[case.label] = made
+            groups.append(summary(case, made))
+            once.append({"meshes": case.label, **found["once"]})
+            print(name, *groups[-1].values(), sep=" | ", flush=True)
     tables = {name: rows, f"{name}, slopes and seconds": groups, f"{name}, paid once": once}
     beside = degrees(by_name)
     return {**tables, f"{name}, degrees at equal seconds": beside} if beside else tables
 
 
 def draw(path, tables):
-    """Errors over seconds, on one rank: bands of three scenes, energy above pressure."""
+    """Errors over seconds, on one rank: a row of panels for each scene, energy and pressure."""
     titles = [title for title in tables if title in SCENES]
-    columns = min(len(titles), 3)
-    bands = -(-len(titles) // columns)
-    with picture(path, columns, 8.6 * bands, rows=2 * bands) as axes:
-        for unused in range(len(titles), columns * bands):
-            for panel in axes[-2 * columns :][unused % columns :: columns]:
-                panel.remove()
+    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "ncols": 2}
+    with picture(path, len(MEASURES), 4.3 * len(titles), rows=len(titles)) as axes:
         for k, title in enumerate(titles):
-            band = axes[2 * columns * (k // columns) :][: 2 * columns]
-            panels = band[k % columns :: columns]
-            for panel, name in zip(panels, MEASURES, strict=True):
+            for panel, name in zip(axes[2 * k :], MEASURES, strict=False):
                 lines: dict[str, tuple[list[float], list[float]]] = {}
                 for row in tables[title]:
                     if not row["meshes"].endswith("ranks"):
@@ -296,16 +422,20 @@ def draw(path, tables):
                         x.append(row["seconds"])
                         y.append(row[name])
                 curves(panel, title, ("seconds", f"relative error, {name}"), lines)
-            panels[0].get_legend().remove()
-            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "ncols": 2}
-            panels[1].legend(fontsize="small", **below)
+                panel.legend(fontsize="small", **below)
+
+
+def configure(parser):
+    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
+    parser.add_argument("--ranks", nargs="+", type=int, default=[1, 2], help="numbers of ranks")
+    configure_clock(parser)
 
 
 def main(argv):
     """Run the cases and write their tables; returns them."""
+    if argv[:1] == ["--worker"]:
+        return worker(*argv[1:3], Path(argv[3]))
     arguments, _ = command_line(__doc__, argv, configure)
-    if any(int(os.environ.get(variable, 1)) > 1 for variable in MPI_VARIABLES):
-        raise RuntimeError("this benchmark starts mpirun itself; run it without")
     tables: Tables = {}
     for name in arguments.scenes:
         with tempfile.TemporaryDirectory() as folder:

@@ -17,9 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
 ROOT = Path(__file__).resolve().parents[1]
 MPI_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
+FILE = "«file»"  # among words of a command: where what it finds is to be written
 # of the report; the rest of the total is the demo's own: forms, closed forms, output
 STAGES = ("mesh", "assembly", "contact", "gluing", "subdomains", "dual", "qp", "recovery")
 COLUMNS = {"subdomains": "K⁺"}  # a table may have a column for their number
@@ -81,22 +83,28 @@ def finish(
     arguments: argparse.Namespace,
     name: str,
     tables: Tables,
-    draw: Callable[[Path, Tables], None],
-    rank: int = 0,
+    draw: Callable[[Path, Tables], None] | None = None,
     shown: Callable[[Tables], Tables] = dict,
 ) -> Tables:
     """Write and print tables and their picture on rank 0; the tables.
 
     With ``--document`` those that ``shown`` makes of them go between their marks in docs/.
     """
-    if rank == 0:
+    if MPI.COMM_WORLD.rank == 0:
         write_tables(arguments.output, name, tables)
-        draw(arguments.output / f"{name}.png", tables)
+        if draw is not None:
+            draw(arguments.output / f"{name}.png", tables)
         if arguments.document:
             write_documents(name, shown(tables), arguments.document)
         for title, rows in tables.items():
             print(f"{title}\n\n{markdown(rows)}\n", flush=True)
     return tables
+
+
+def say(row: Mapping[str, Any]) -> None:
+    """Print a row on rank 0 at once: large scenes take their time."""
+    if MPI.COMM_WORLD.rank == 0:
+        print(*map(_text, row.values()), sep=" | ", flush=True)
 
 
 def write_documents(name: str, tables: Tables, commit: str, folder: Path = ROOT / "docs") -> None:
@@ -114,29 +122,40 @@ def write_documents(name: str, tables: Tables, commit: str, folder: Path = ROOT 
             path.write_text(made)
 
 
+def started(words: Sequence[object], ranks: int, **environment: str) -> str:
+    """What a program prints, run on so many ranks in processes of its own.
+
+    Raises:
+        RuntimeError: This process is one of several itself, or the program fails.
+    """
+    if any(int(os.environ.get(variable, 1)) > 1 for variable in MPI_VARIABLES):
+        raise RuntimeError("this benchmark starts mpirun itself; run it without")
+    command = ["mpirun", "-n", *map(str, (ranks, *words))]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode != 0:
+        said = "\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:])
+        raise RuntimeError(f"{' '.join(command)} failed:\n{said}")
+    return done.stdout
+
+
+def json_of(words: Sequence[object], ranks: int, **environment: str) -> Any:
+    """The JSON that a program writes where ``FILE`` stands among its words, run as ``started``."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "found.json"
+        started([file if word is FILE else word for word in words], ranks, **environment)
+        return json.loads(file.read_text())
+
+
 def run_demo(name: str, arguments: Sequence[object], ranks: int) -> dict[str, Any]:
     """The report of a demo, run on so many ranks in processes of its own.
 
     It also has seconds of the ``processor``: of all ranks, start and mesh included. On a machine
     that others use, too, they say more than those of the wall, but for waiting for each other.
-
-    Raises:
-        RuntimeError: This process is one of several itself, or the demo fails.
     """
-    if any(int(os.environ.get(variable, 1)) > 1 for variable in MPI_VARIABLES):
-        raise RuntimeError("this benchmark starts mpirun itself; run it without")
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "report.json"
-        command = ["mpirun", "-n", ranks, sys.executable, ROOT / "demos" / f"{name}.py"]
-        command += [*arguments, "--report", report]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        words = [str(word) for word in command]
-        before = processor_seconds()
-        done = subprocess.run(words, capture_output=True, text=True, env=environment)
-        if done.returncode != 0 or not report.exists():
-            said = "\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:])
-            raise RuntimeError(f"{' '.join(words)} failed:\n{said}")
-        return {**json.loads(report.read_text()), "processor": processor_seconds() - before}
+    before = processor_seconds()
+    demo = [sys.executable, ROOT / "demos" / f"{name}.py", *arguments, "--report", FILE]
+    return {**json_of(demo, ranks), "processor": processor_seconds() - before}
 
 
 def processor_seconds() -> float:

@@ -21,14 +21,14 @@ class Made(Exception):  # noqa: N818  # it is no error
 
 def run(name: str, arguments: Sequence[object] = ()) -> tuple[Any, Any]:
     """Run a demo in this process as its command line would; its solution and report. Collective."""
-    problem = _executed(name, arguments)["problem"]
+    problem = names_of(name, arguments)["problem"]
     problem.destroy()
     return problem.solution, problem.report
 
 
 def steps_of(name: str, arguments: Sequence[object] = ()) -> list[tfeti.StepRecord]:
     """Run a demo of load steps in this process; the records of its steps. Collective."""
-    names = _executed(name, arguments)
+    names = names_of(name, arguments)
     names["problem"].destroy()
     found: list[tfeti.StepRecord] = names["records"]
     return found
@@ -50,7 +50,7 @@ def scene(
 
     setattr(tfeti, problem, stop)
     try:
-        _executed(name, arguments)
+        names_of(name, arguments)
     except Made as found:
         made_of: dict[str, Any] = found.args[0]
         return made_of
@@ -59,7 +59,7 @@ def scene(
     raise RuntimeError(f"demos/{name}.py makes no {problem}")
 
 
-def _executed(name: str, arguments: Sequence[object]) -> dict[str, Any]:
+def names_of(name: str, arguments: Sequence[object]) -> dict[str, Any]:
     """Return a demo's names after a run; options of PETSc stand among the arguments."""
     words = [str(word) for word in arguments]
     before, database, given = sys.argv, PETSc.Options(), petsc_options(words)

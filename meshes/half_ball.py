@@ -6,7 +6,6 @@ python3 meshes/half_ball.py half_ball.msh --partitions 16
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import gmsh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from meshes.tools import graded_size, partition, script, started_model, use_sizes
+from meshes.tools import graded_size, partition, script, started_model
 
 HXT = 10
 
@@ -26,7 +25,6 @@ def build(
     fine_radius: float = 0.06,
     growth: float = 0.3,
     partitions: int = 0,
-    sizes: Callable[[], int] | None = None,
 ) -> Any:
     """Mesh the half ball |x − (0, 0, R)| ≤ R, z ≤ R on this rank and return gmsh's model.
 
@@ -38,7 +36,6 @@ def build(
         fine_radius: Size of the fine zone.
         growth: Growth of the element size with the distance from that zone.
         partitions: Number of gmsh's partitions, 0 for none.
-        sizes: Makes a gmsh field of element sizes instead.
     """
     model = started_model("half_ball")
     ball = model.occ.addSphere(0.0, 0.0, radius, radius, angle1=-pi / 2, angle2=0.0)
@@ -49,10 +46,7 @@ def build(
     model.addPhysicalGroup(3, [ball], name="body")
     model.addPhysicalGroup(2, [tag for tag in surfaces if tag != top], name="contact")
     model.addPhysicalGroup(2, [top], name="top")
-    if sizes is None:
-        graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
-    else:
-        use_sizes(sizes())
+    graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
     gmsh.option.setNumber("Mesh.Algorithm3D", HXT)
     gmsh.model.mesh.generate(3)
     partition(partitions)

@@ -6,7 +6,6 @@ python3 meshes/half_cylinder.py half_cylinder.msh --partitions 8
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import gmsh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from meshes.tools import graded_size, partition, script, started_model, use_sizes
+from meshes.tools import graded_size, partition, script, started_model
 
 
 def build(
@@ -23,7 +22,6 @@ def build(
     fine_radius: float = 0.06,
     growth: float = 0.15,
     partitions: int = 0,
-    sizes: Callable[[], int] | None = None,
 ) -> Any:
     """Mesh the half disc x² + (y − R)² ≤ R², y ≤ R on this rank and return gmsh's model.
 
@@ -36,7 +34,6 @@ def build(
         fine_radius: Size of the fine zone.
         growth: Growth of the element size with the distance from that zone.
         partitions: Number of gmsh's partitions, 0 for none.
-        sizes: Makes a gmsh field of element sizes instead.
     """
     model = started_model("half_cylinder")
     geo = model.geo
@@ -56,10 +53,7 @@ def build(
     model.addPhysicalGroup(1, arcs, name="contact")
     model.addPhysicalGroup(1, top, name="top")
     model.addPhysicalGroup(1, [axis], name="axis")
-    if sizes is None:
-        graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
-    else:
-        use_sizes(sizes())
+    graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
     gmsh.model.mesh.generate(2)
     partition(partitions)
     return model

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import gmsh
-import numpy as np
 
 # gmsh's own: where the sizes of elements come from
 SIZES_FROM = {"FromPoints": 1, "FromCurvature": 0, "ExtendFromBoundary": 1}
@@ -79,22 +78,6 @@ def use_sizes(*fields: int) -> None:
     gmsh.model.mesh.field.setAsBackgroundMesh(least)
     for name in SIZES_FROM:
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
-
-
-def sizes_from_simplices(corners: Any, sizes: Any) -> int:
-    """A gmsh field of element sizes that are given on simplices, and linear in each of them.
-
-    Args:
-        corners: Shape ``(n, 3, 3)`` or ``(n, 4, 3)``: corners of triangles or tetrahedra, and their
-            coordinates.
-        sizes: Sizes at the corners, shape ``(n, 3)`` or ``(n, 4)``.
-    """
-    view, count = gmsh.view.add("sizes"), sizes.shape[1]
-    table = np.concatenate((np.swapaxes(corners, 1, 2).reshape(-1, 3 * count), sizes), axis=1)
-    gmsh.view.addListData(view, {3: "ST", 4: "SS"}[count], len(table), table.ravel())
-    field = gmsh.model.mesh.field.add("PostView")
-    gmsh.model.mesh.field.setNumber(field, "ViewTag", view)
-    return int(field)
 
 
 def add_mirror_image(model: Any, axis: int) -> dict[tuple[int, int], int]:

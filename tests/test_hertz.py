@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from benchmarks import profiles
-from benchmarks.hertz import LineContact
+from benchmarks.pressures import LineContact, Samples, errors
 from benchmarks.tools import slope
 from demos import run
 
@@ -30,7 +29,7 @@ def study(demo, argument, values, sizes, half_width):
         Rows, and orders of convergence over the sizes of elements.
     """
     found, rows, gdim = [], [], int(demo[-2])
-    samples = (profiles.Samples.line if gdim == 2 else profiles.Samples.disc)(half_width)
+    samples = (Samples.line if gdim == 2 else Samples.disc)(half_width)
     for value in values:
         solution, report = run(demo, [argument, value, "-tfeti_rtol", "1e-8"])
         data = solution.contact(0)
@@ -38,7 +37,7 @@ def study(demo, argument, values, sizes, half_width):
         found.append(samples.at(*(np.concatenate(part) for part in zip(*parts, strict=True))))
         rows.append({"pressure_l2": report.errors["pressure_l2"]})
     for row, pressure in zip(rows[:-1], found[:-1], strict=True):
-        row["pressure_l2_finer"] = profiles.errors(samples, pressure, found[-1])["pressure"]
+        row["pressure_l2_finer"] = errors(samples, pressure, found[-1])["pressure"]
     names = ("pressure_l2", "pressure_l2_finer")
     return rows[:-1], {n: slope(sizes[:-1], [row[n] for row in rows[:-1]]) for n in names}
 
@@ -82,10 +81,10 @@ def test_a_cylinder_on_a_block_is_near_the_closed_form():
             "exchanged": ["--exchange"],
         }.items()
     }
-    for errors in runs.values():
-        assert abs(errors["force"]) <= 1e-8
+    for found in runs.values():
+        assert abs(found["force"]) <= 1e-8
     for name in ("half_width", "peak_pressure"):
-        default, exchanged = (errors[name] for errors in runs.values())
+        default, exchanged = (found[name] for found in runs.values())
         assert abs(default) <= 0.03
         assert abs(exchanged - default) <= 0.01
 

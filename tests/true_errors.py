@@ -10,7 +10,7 @@ from mpi4py import MPI
 from scenes import hooke, strain
 
 import tfeti_dolfinx as tfeti
-from benchmarks.hertz import LineContact
+from benchmarks.pressures import LineContact
 from demos import scene
 from meshes.half_cylinder import build
 from meshes.rings import INNER, MIDDLE, OUTER, lame_pressure, rings

@@ -37,11 +37,11 @@ def told(words):
 
 
 def solve_here(size, order, file, **other):
-    """Solve by this package: a case of benchmarks/error_case.py."""
+    """Solve by this package: a case of benchmarks/time_against_error.py."""
     words = {"scene": "half cylinder", "sizes": [size], "degree": order, "order": order}
     case = json.dumps({**words, "processor": True, **other})
-    program = str(ROOT / "benchmarks" / "error_case.py")
-    return told([*OURS, program, case, str(file), str(file.parent / "stresses.npz")])
+    program = [str(ROOT / "benchmarks" / "time_against_error.py"), "--worker"]
+    return told([*OURS, *program, case, str(file), str(file.parent / "stresses.npz")])
 
 
 def compare(order, size, folder):
@@ -66,7 +66,7 @@ def rows_of(folder):
     import numpy as np
 
     from benchmarks.error_scenes import SCENES
-    from benchmarks.profiles import errors
+    from benchmarks.pressures import errors
 
     samples = SCENES["half cylinder"]().samples
     (reference,) = json.loads((folder / "reference.json").read_text())["rows"]

@@ -19,11 +19,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 from mpi4py import MPI
 
 from benchmarks.stress.judge import run_scene

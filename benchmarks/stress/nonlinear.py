@@ -25,11 +25,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import petsc4py
-
-if __name__ == "__main__":
-    petsc4py.init(sys.argv[:1])
-
 import basix.ufl
 import numpy as np
 import ufl

@@ -1,0 +1,73 @@
+"""Elastic bodies on a torn mesh: loads and conditions are added by the names of surfaces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import ufl
+from dolfinx import fem
+
+import tfeti_dolfinx as tfeti
+
+
+class Elastic:
+    """Elastic bodies with their space.
+
+    Args:
+        decomposition: The torn mesh.
+        E: Young's modulus, or moduli of volumes.
+        nu: Poisson's ratio.
+        model: As for ``Elasticity``.
+        degree: Of the displacement.
+    """
+
+    def __init__(
+        self, decomposition: tfeti.Decomposition, E: Any, nu: float, model: str, degree: int = 1
+    ) -> None:
+        self.decomposition = d = decomposition
+        self.gdim = d.mesh.geometry.dim
+        self.elastic = tfeti.Elasticity(d, E=E, nu=nu, model=model)
+        self.V = fem.functionspace(d.mesh, ("Lagrange", degree, (self.gdim,)))
+        self.u, self.v = ufl.TrialFunction(self.V), ufl.TestFunction(self.V)
+        self._ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+        self.bcs: list[fem.DirichletBC] = []
+        self.L: Any = ufl.ZeroBaseForm((self.v,))
+
+    def constant(self, *values: float) -> fem.Constant:
+        """A number, or a vector, that may be changed without compiling anything."""
+        return fem.Constant(self.decomposition.mesh, values if len(values) > 1 else values[0])
+
+    def ds(self, surface: str) -> Any:
+        """The measure of a surface."""
+        return self._ds(self.decomposition.surface(surface))
+
+    def dofs(self, surface: str, axis: int) -> Any:
+        """Dofs of a component on a surface."""
+        facets = self.decomposition.facets(surface)
+        return fem.locate_dofs_topological(self.V.sub(axis), self.gdim - 1, facets)
+
+    def hold(self, surface: str, axis: int, value: float = 0.0) -> fem.Constant:
+        """Prescribe a component; returns what its value may be changed by."""
+        given = self.constant(value)
+        self.bcs.append(fem.dirichletbc(given, self.dofs(surface, axis), self.V.sub(axis)))
+        return given
+
+    def load(self, surface: str, traction: Any) -> None:
+        """Add a traction, a vector in UFL."""
+        self.L += self.elastic.thickness * ufl.dot(traction, self.v) * self.ds(surface)
+
+    def parts(self, contacts: list[Any]) -> dict[str, Any]:
+        """Arguments of the linear problem."""
+        return {
+            "a": self.elastic.a(self.u, self.v),
+            "L": self.L,
+            "bcs": self.bcs,
+            "contacts": contacts,
+            "decomposition": self.decomposition,
+            "stress": self.elastic.stress,
+            "thickness": self.elastic.thickness,
+        }
+
+    def problem(self, contacts: list[Any], **options: Any) -> tfeti.ContactProblem:
+        """The linear problem, to rtol 1e-8."""
+        return tfeti.ContactProblem(**self.parts(contacts), petsc_options={"rtol": 1e-8, **options})
