@@ -549,7 +549,7 @@ def test_meshes_that_do_not_fit_are_named(comm):
     ):
         with pytest.raises(tfeti.InputError, match=words):
             tfeti.SurfaceMesh(points, facets)
-    with pytest.raises(tfeti.InputError, match="no file"):
+    with pytest.raises(tfeti.InputError, match="no such file"):
         tfeti.read_surface("missing.stl", comm)
 
 

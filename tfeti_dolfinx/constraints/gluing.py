@@ -31,7 +31,7 @@ from tfeti_dolfinx.constraints.rows import (
 from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.dofs import TornDofs, component_of, described, is_same_space
+from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
 # --- Rows of interfaces and Dirichlet conditions ----------------------------------------------
@@ -246,8 +246,10 @@ def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
             f"the value of {what} is a function on another mesh; expected one on "
             "decomposition.mesh, the torn mesh, such as decomposition.from_original(g)"
         )
-    own = component_of(V, list(space.component()))
-    if own is None or not is_same_space(space, own):
+    own, component = V._cpp_object, list(space.component())
+    if len(component) == 1 and 0 <= component[0] < V.num_sub_spaces:
+        own = own.sub(component)
+    if not is_same_space(space, own):
         raise InputError(
             f"{what} is on {described(space)}; expected the space of a, "
             f"{described(V._cpp_object)}, or V.sub(i) of it"

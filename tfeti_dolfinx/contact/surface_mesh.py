@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from tfeti_dolfinx.common.arrays import Array, ArrayLike, sum_rows
 from tfeti_dolfinx.common.validation import checked_type, named, real_numbers
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.gmsh_model import open_model
 
 
 class SurfaceMesh:
@@ -194,26 +195,9 @@ def read_surface(path: str | os.PathLike[str], comm: MPI.Intracomm) -> SurfaceMe
 
 def _triangles(path: Path) -> tuple[Array, Array]:
     """Return points and triangles that gmsh finds in a file."""
-    import gmsh
-
-    if not path.is_file():
-        raise InputError(f"{path} is no file; expected an STL file or a mesh of gmsh's")
-    begun = not gmsh.isInitialized()
-    if begun:
-        gmsh.initialize(interruptible=False)
-    gmsh.option.setNumber("General.Terminal", 0)
-    before = gmsh.model.getCurrent()
-    gmsh.model.add("surface of a tool")
-    try:
-        gmsh.merge(str(path))
-        tags, x, _ = gmsh.model.mesh.getNodes()
-        _, corners = gmsh.model.mesh.getElementsByType(2)
-    finally:
-        gmsh.model.remove()
-        if begun:
-            gmsh.finalize()
-        elif before:
-            gmsh.model.setCurrent(before)
+    with open_model(path) as model:
+        tags, x, _ = model.mesh.getNodes()
+        _, corners = model.mesh.getElementsByType(2)
     if not len(corners):
         raise InputError(f"{path} has no triangles")
     place = np.zeros(int(tags.max()) + 1, dtype=np.int64)

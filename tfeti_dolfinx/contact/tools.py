@@ -174,15 +174,11 @@ class Tools:
 
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""
-        return [
-            ToolMotion(
-                body.name,
-                self.pose(i).motion,
-                self.poses[i].centre,
-                np.flatnonzero(self.of_contact == i),
-            )
-            for i, body in enumerate(self.bodies)
-        ]
+        found = []
+        for i, (body, pose) in enumerate(zip(self.bodies, self.poses, strict=True)):
+            contacts = np.flatnonzero(self.of_contact == i)
+            found.append(ToolMotion(body.name, self.pose(i).motion, pose.centre, contacts))
+        return found
 
     def take(self, values: Array) -> None:
         """Take the unknowns of a solution, those of this rank. Collective.

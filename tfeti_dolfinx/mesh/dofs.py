@@ -55,14 +55,6 @@ def is_same_space(V: Any, W: Any) -> bool:
     )
 
 
-def component_of(V: fem.FunctionSpace, component: list[int]) -> Any:
-    """C++ space of a component of V; None if it has no such component."""
-    space = V._cpp_object
-    if len(component) > 1 or any(not 0 <= i < V.num_sub_spaces for i in component):
-        return None
-    return space.sub(component) if component else space
-
-
 def described(V: Any) -> str:
     """A C++ space for messages."""
     try:

@@ -95,7 +95,6 @@ def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
 class FacetKind:
     """Cell type and elements that all contact facets of a problem have in common."""
 
-    facet: str  # interval, triangle or quadrilateral
     hats: FacetElement  # P1 (Q1) element of the multipliers
     displacement: FacetElement  # element of the displacement's trace
     geometry: FacetElement  # element of the geometry
@@ -150,7 +149,6 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
     facet = FACET_OF[mesh.topology.cell_type.name]
     geometry = mesh.ufl_domain().ufl_coordinate_element()
     return FacetKind(
-        facet=facet,
         hats=FacetElement(facet, 1, element.lagrange_variant),
         displacement=FacetElement(facet, element.degree, element.lagrange_variant),
         geometry=FacetElement(facet, geometry.degree, geometry.lagrange_variant),
@@ -176,7 +174,7 @@ def local_facets(dofs: TornDofs, facets: Array) -> Facets:
     inside = mesh.geometry.x[nodes[:, : coordinate.dim // gdim]].mean(axis=1)[:, :gdim]
     hats, corners = kind.hats, x[:, : kind.hats.size]
     (normal,) = _normals(hats, corners, hats.points.mean(axis=0)[None])
-    area = (0.5 if kind.facet == "triangle" else 1.0) * np.linalg.norm(normal, axis=1)
+    area = (0.5 if kind.hats.facet == "triangle" else 1.0) * np.linalg.norm(normal, axis=1)
     outward = np.sum(normal * (corners.mean(axis=1) - inside), axis=1)
     normal = _unit(np.where(outward < 0.0, -1.0, 1.0)[:, None] * normal)
     at_vertices = _normals(kind.geometry, x, hats.points)
@@ -260,7 +258,7 @@ def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, A
 
     Return the facet of each point, reference coordinates of shape ``(m, tdim)``, weights.
     """
-    xi, w = basix.make_quadrature(getattr(basix.CellType, kind.facet), degree)
+    xi, w = basix.make_quadrature(getattr(basix.CellType, kind.hats.facet), degree)
     n, q = len(facets), len(w)
     slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), from_first(facets.x))
     weight = _areas(slopes.reshape(n * q, *slopes.shape[2:])) * np.tile(w, n)

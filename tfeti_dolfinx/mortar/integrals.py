@@ -42,7 +42,11 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
         sum_rows(place, exchange.send(part.reshape(n * v, *part.shape[2:])), len(vertex))
         for part in (M, b, sharp)
     )
-    S, r = _without_slopes(M, b, gdim - 1)
+    # the normal equations of K alone: the Schur complement of a, the first unknowns
+    a, K = slice(gdim - 1), slice(gdim - 1, None)
+    eliminated = M[:, K, a] @ np.linalg.pinv(M[:, a, a], hermitian=True)
+    S = M[:, K, K] - eliminated @ M[:, a, K]
+    r = b[:, K] - np.einsum("gij,gj->gi", eliminated, b[:, a])
     S[sharp > 0.0], r[sharp > 0.0] = 0.0, 0.0
     S, r = (exchange.answer(part[place]).reshape(n, v, *part.shape[1:]) for part in (S, r))
     return replace(facets, curvature=_on_facets(facets, axes, S, r))
@@ -88,15 +92,6 @@ def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Arr
     rows = np.concatenate((u * inverse[..., None], _monomials(u)), axis=3)
     height = np.einsum("nvwg,nvg->nvw", d, normals) * inverse**2
     return rows.swapaxes(2, 3) @ rows, np.einsum("nvwi,nvw->nvi", rows, height)
-
-
-def _without_slopes(M: Array, b: Array, count: int) -> tuple[Array, Array]:
-    """The normal equations of K alone: the Schur complement of a, the first ``count`` unknowns."""
-    on_a = np.linalg.pinv(M[:, :count, :count], hermitian=True)
-    eliminated = M[:, count:, :count] @ on_a
-    S = M[:, count:, count:] - eliminated @ M[:, :count, count:]
-    r = b[:, count:] - np.einsum("gij,gj->gi", eliminated, b[:, :count])
-    return S, r
 
 
 def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:

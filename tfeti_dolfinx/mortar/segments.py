@@ -210,11 +210,13 @@ def find_segments(
     found = found[planes.first_layer(found)]
     # 4. quadrature on the planes, and the points of both facets over it
     pair, y, weight = found.parts.quadrature(_degree(kind, secondary, primary))
-    at = planes.facing(found, pair, y)
+    at, s = planes.facing(found, pair, y), found.s[pair]
+    on_plane = densities(kind.geometry, planes.nodes[s], at.xi)
+    slant = densities(kind.geometry, secondary.x[s], at.xi) / on_plane
     covered = np.bincount(found.s, found.parts.size, minlength=len(secondary))
     return Segments(
         points=at,
-        weight=weight * planes.slant(at),
+        weight=weight * slant,
         corners=planes.facing(found, *found.parts.corners()),
         whole=covered >= (1.0 - SEARCH.uncovered) * planes.size,
         averted=averted,
@@ -241,11 +243,11 @@ class _Planes:
 
     def __init__(self, kind: FacetKind, secondary: Facets, primary: Facets) -> None:
         self._kind, self._secondary, self._primary = kind, secondary, primary
-        self._order = POLYGON[kind.facet]
+        self._order = POLYGON[kind.hats.facet]
         self.normal = centre_normals(secondary)
         self._centre, self._tangents = secondary.corners.mean(axis=1), tangents(self.normal)
-        self._nodes = self._on_planes(secondary.x, np.arange(len(secondary)))
-        self.corners = self._nodes[:, : kind.hats.size]
+        self.nodes = self._on_planes(secondary.x, np.arange(len(secondary)))
+        self.corners = self.nodes[:, : kind.hats.size]
         self.size = sizes(self.corners[:, self._order])
 
     def meetings(self, s: Array, p: Array) -> _Meetings:
@@ -313,15 +315,9 @@ class _Planes:
         return FacingPoints(
             secondary=s,
             primary=p,
-            xi=reference_points(element, self._nodes[s], y),
+            xi=reference_points(element, self.nodes[s], y),
             eta=reference_points(element, there[pair], y),
         )
-
-    def slant(self, at: FacingPoints) -> Array:
-        """Area on the secondary facet per area on its plane, shape ``(m,)``."""
-        element, s = self._kind.geometry, at.secondary
-        area = densities(element, self._secondary.x[s], at.xi)
-        return area / densities(element, self._nodes[s], at.xi)
 
     def _on_planes(self, x: Array, s: Array) -> Array:
         """Return coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
@@ -342,7 +338,7 @@ class _Planes:
 def _degree(kind: FacetKind, secondary: Facets, primary: Facets) -> int:
     """Degree of the quadrature: exact on plane intervals, triangles and parallelograms."""
     exact = 1 + kind.displacement.degree + (SEARCH.curved_degree if kind.geometry.degree > 1 else 0)
-    if kind.facet != "quadrilateral":
+    if kind.hats.facet != "quadrilateral":
         return exact
     for facets in (secondary, primary):
         a, b, c, d = facets.corners.transpose(1, 0, 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -112,8 +112,8 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
         return stiffness.solve(B)[trace]
 
     rows = [np.searchsorted(trace, own) for own in traces]
-    places, work = _places(rows, len(trace), [part for _, part in equal]), 4.0 * stiffness.entries
-    return Group(len(equal), len(trace), len(equal), *places, partial(_in_chunks, apply), work)
+    work = 4.0 * stiffness.entries
+    return _group(equal, rows, len(trace), partial(_in_chunks, apply), work)
 
 
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
@@ -122,9 +122,8 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     work = 2.0 * traced.stiffness.count
     if traced.inner is not None:
         work += 4.0 * (traced.coupling.count + traced.inner.entries)
-    size, parts = len(traced.trace), [part for _, part in equal]
-    places = _places([block.trace_rows for block, _ in equal], size, parts)
-    return Group(len(equal), size, len(equal), *places, traced.apply_schur, work)
+    rows = [block.trace_rows for block, _ in equal]
+    return _group(equal, rows, len(traced.trace), traced.apply_schur, work)
 
 
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
@@ -139,16 +138,8 @@ def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
         data, shape = np.concatenate([K.data for K in matrices]), (int(begins[-1]),) * 2
         K_bb = LocalMatrix(Entries(data, np.concatenate(columns), table, shape))
         rows = [np.concatenate([a + row for a, row in zip(begins, rows, strict=False)])]
-    size, parts = K_bb.shape[0], [part for _, part in blocks]
-    return Group(
-        len(blocks),
-        size,
-        len(rows),
-        *_places(rows, size, parts),
-        K_bb.__matmul__,
-        2.0 * K_bb.count,
-        can_be_dense=False,
-    )
+    group = _group(blocks, rows, K_bb.shape[0], K_bb.__matmul__, 2.0 * K_bb.count)
+    return replace(group, can_be_dense=False)
 
 
 def _own_group(block: Block, kind: OperatorKind, part: slice) -> Group:
@@ -160,14 +151,20 @@ def _own_group(block: Block, kind: OperatorKind, part: slice) -> Group:
             return np.asarray(apply(W))
         return np.stack([apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
 
-    places = _places([np.arange(size)], size, [part])
-    return Group(1, size, 1, *places, columns, 0.0)
+    return _group([(block, part)], [np.arange(size)], size, columns, 0.0)
 
 
-def _places(rows: Sequence[Array], size: int, parts: Sequence[slice]) -> tuple[Array, Array]:
-    """Return ``place`` and ``where`` of a group with these rows of its matrix in each column."""
+def _group(
+    blocks: Sequence[tuple[Block, slice]],
+    rows: Sequence[Array],
+    size: int,
+    apply: Callable[[Array], Array],
+    work: float,
+) -> Group:
+    """Return a group with these rows of its matrix in each column."""
     place = np.concatenate([k * size + row for k, row in enumerate(rows)])
-    return place, np.concatenate([np.arange(part.start, part.stop) for part in parts])
+    where = np.concatenate([np.arange(part.start, part.stop) for _, part in blocks])
+    return Group(len(blocks), size, len(rows), place, where, apply, work)
 
 
 def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
