@@ -351,6 +351,8 @@ class Gluing:
 
         Where other components are prescribed all rows of equalities are. Collective.
         """
+        if earlier.constraints is self.constraints:
+            return np.array(lam)
         sets, before = self.constraints.sets, earlier.constraints.sets
         start = np.zeros(self.constraints.num_rows)
         flags, flags_before = self.prescribed.flag, earlier.prescribed.flag

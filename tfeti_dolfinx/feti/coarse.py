@@ -8,7 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array, hstack
 
-from tfeti_dolfinx.common.arrays import Array, rows_times
+from tfeti_dolfinx.common.arrays import Array, LocalMatrix, rows_times
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
@@ -48,7 +48,8 @@ class CoarseSpace(Coarse):
         subdomains: This rank's Blocks.
         dimension: r, the dimension of the kernel of K.
         e: (R T)ᵀ f, shape ``(r,)``.
-        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
+        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``; ``work``
+            is the product of their transpose with an r-vector.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
         rubbing: Local rows of friction.
@@ -95,6 +96,8 @@ class CoarseSpace(Coarse):
             comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
         )
         self.motions = self._basis.coordinates(self.bodies.motions)
+        self.work = LocalMatrix(csr_array(self.motions.T)).__matmul__
+        self._directions = LocalMatrix(csr_array(self._basis.motions.T))
         Gt = self._basis.rows(Gt, rows_times(self.J, self.row_size), equalities)
         self.null = bcast_from_root(comm, orthonormal_columns(self.motions @ both))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
@@ -109,7 +112,7 @@ class CoarseSpace(Coarse):
         if not self.dimension:
             return np.zeros(0)
         e = joined_over(self.comm, self.subdomains.kernel_load)
-        return np.concatenate((self._basis.motions.T @ e, e[self._basis.rest]))
+        return np.concatenate((self._directions @ e, e[self._basis.rest]))
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""

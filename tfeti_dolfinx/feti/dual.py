@@ -193,7 +193,7 @@ class Dual:
         coarse, comm = self.coarse, self.coarse.comm
         if not coarse.dimension:
             return
-        load = coarse.motions.T @ coarse.e
+        load = coarse.work(coarse.e)
         known, size = self._held_load, float(np.linalg.norm(load))
         if known is not None:
             apart = float(np.linalg.norm(load - size * known))

@@ -113,14 +113,14 @@ def _balanced(
     if norm > 0.0:
         missed = constraints.jumps(u[subdomains.trace]) - constraints.c
         wanted = lam + missed / norm
-    found = project_onto_feasible(coarse, dual.feasible, wanted)
-    if found.missing > HELD:
+    found, _ = project_onto_feasible(coarse, dual.feasible, wanted)
+    if imbalance(coarse, found) > HELD:
         return lam, u, float("inf")
     # −K⁺Bᵀ(λ' − λ) + Rα, α such that rows miss as much as before
     zero = np.zeros_like(u)
-    change = elastic_displacement(constraints, subdomains, found.lam - lam, zero)
+    change = elastic_displacement(constraints, subdomains, found - lam, zero)
     if coarse.dimension:
         rows = constraints.jumps(change[subdomains.trace])
         change = change - coarse.kernel_motion(coarse.solve(coarse.G(rows)))
     energy = summed(coarse.comm, np.array([sum(subdomains.energies(change))]))[0]
-    return found.lam, u + change, float(np.sqrt(max(energy, 0.0)))
+    return found, u + change, float(np.sqrt(max(energy, 0.0)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -123,16 +123,18 @@ SHIFTS = (0.0, 1e-14, 1e-13, 1e-12)
 
 
 class NullModes:
-    """Orthonormal columns that a semidefinite matrix makes nothing of, shape ``(r, k)``."""
+    """Orthonormal columns that a semidefinite matrix makes nothing of, shape ``(r, k)``.
+
+    ``removed`` is x less its part in the null space, shape ``(r,)`` or ``(r, q)``.
+    """
 
     def __init__(self, columns: csr_array) -> None:
         self._columns = LocalMatrix(columns)
         self._parts = [(rows, dense) for _, rows, dense in parts_of_columns(columns)]
+        self.removed: Callable[[Array], Array] = self._removed if self._parts else np.asarray
 
-    def removed(self, x: Array) -> Array:
-        """x less its part in the null space, shape ``(r,)`` or ``(r, q)``."""
-        N = self._columns
-        return np.asarray(x - N @ N.transposed(x)) if self._parts else x
+    def _removed(self, x: Array) -> Array:
+        return np.asarray(x - self._columns @ self._columns.transposed(x))
 
     def pinned(self, scale: Array) -> Array:
         """1 at entries that determine the modes, scaled by 1/``scale``; 0 at others."""

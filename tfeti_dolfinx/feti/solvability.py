@@ -245,7 +245,7 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
     # nothing where no rank has rows
     of_cones, of_given = (tuple(of) if of and of[0].shape[0] else () for of in axes)
     return RigidScene(
-        Z.T @ (coarse.motions.T @ coarse.e),
+        Z.T @ (coarse.work(coarse.e)),
         bodies.negligible[body],
         body,
         vstack(normals, format="csr"),

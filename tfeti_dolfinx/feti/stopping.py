@@ -256,10 +256,11 @@ class Accuracy(StoppingRule):
         if before is not None and before.residual > 0.0:
             fell = (residual / self._claimed) ** given.stall
             stalled = now.residual / before.residual > fell
+        worst = self.ratio()
         ratio, own, longest, in_energy, bound, lags = steering(
             self._dual.coarse.comm,
-            self.ratio(),
-            self.ratio(changes=False),
+            worst,
+            worst if before is None else self.ratio(changes=False),
             self.measures.longest,
             now.error / max(given.energy * self.rtol * now.energy, TINY),
             self._over_goal(),

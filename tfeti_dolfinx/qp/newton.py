@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.projection import UNBALANCED, FeasiblePoint, WithinFace, project_onto_feasible
+from tfeti_dolfinx.qp.projection import UNBALANCED, WithinFace, project_onto_feasible
 from tfeti_dolfinx.qp.sets import Face, Status
 
 # least status of rows with friction
@@ -94,10 +94,10 @@ def first_point(qp: QP) -> Array:
         # where 0 is inside of Ω, as with adhesion, rows of contact are free and may leave it
         if held and not any_rank(qp.coarse.comm, qp.feasible.project(lam) != lam):
             return lam
-    return _on_foundation(qp, project_onto_feasible(qp.coarse, qp.feasible, zero))
+    return _on_foundation(qp, project_onto_feasible(qp.coarse, qp.feasible, zero)[0])
 
 
-def _on_foundation(qp: QP, least: FeasiblePoint, max_it: int = 20, alike: float = 0.1) -> Array:
+def _on_foundation(qp: QP, lightest: Array, max_it: int = 20, alike: float = 0.1) -> Array:
     """Return forces of rigid bodies on springs that balance the load: which rows touch first.
 
     It is the feasible point nearest to the forces of springs that gaps press. How many rows carry
@@ -105,11 +105,11 @@ def _on_foundation(qp: QP, least: FeasiblePoint, max_it: int = 20, alike: float 
     until these numbers differ by no more than the share ``alike``. Where the least λ of Ω does not
     balance the load, it is that. Collective.
     """
-    if qp.foundation is None or least.missing > UNBALANCED:
-        return least.lam
-    count, lam = 1, least.lam
+    if qp.foundation is None or imbalance(qp.coarse, lightest) > UNBALANCED:
+        return lightest
+    count, lam = 1, lightest
     for _ in range(max_it):
-        lam = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count)).lam
+        lam = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count))[0]
         touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
         before = count
         count = max(int(summed(qp.coarse.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
@@ -127,9 +127,9 @@ def feasible_start(qp: QP, start: Start) -> Array:
     """
     on = qp.feasible.project(start.lam)
     for within in (WithinFace(qp.feasible, qp.feasible.face(on, -on)), qp.feasible):
-        found = project_onto_feasible(qp.coarse, within, start.lam)
-        if found.missing <= UNBALANCED:
-            return found.lam
+        found, _ = project_onto_feasible(qp.coarse, within, start.lam)
+        if imbalance(qp.coarse, found) <= UNBALANCED:
+            return found
     return first_point(qp)
 
 
@@ -197,8 +197,8 @@ class NewtonIteration:
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
         self.s = self.z.g - normal(self.mu)
         wanted = self.z.lam - self.s / self.norm
-        found = project_onto_feasible(self.coarse, self.feasible, wanted)
-        self.back, self.mu = found.lam, self.mu + self.norm * found.alpha
+        self.back, alpha = project_onto_feasible(self.coarse, self.feasible, wanted)
+        self.mu = self.mu + self.norm * alpha
         self.s = self.z.g - normal(self.mu)
         self.pressed = self.feasible.face(self.back, self.s)
         moved = self.z.lam - self.back
@@ -348,9 +348,9 @@ class FaceSolver:
         if self._curved and not out:
             assert self._face is not None
             boundary = WithinFace(self._qp.feasible, self._face, slipping=True)
-            found = project_onto_feasible(self._qp.coarse, boundary, end.lam)
-            g = end.g + self._qp.F(found.lam - end.lam)
-            end, out = Point(found.lam, g), found.missing > HELD
+            found, _ = project_onto_feasible(self._qp.coarse, boundary, end.lam)
+            end = Point(found, end.g + self._qp.F(found - end.lam))
+            out = imbalance(self._qp.coarse, found) > HELD
         return end, not out
 
     def _enter(self, face: Face) -> bool:
@@ -387,10 +387,10 @@ class FaceSolver:
         lam = on + self.coarse.combined(self.coarse.solve(qp.coarse.residual(on)))
         if imbalance(qp.coarse, lam) > HELD:
             within = WithinFace(qp.feasible, before, slipping=True)
-            found = project_onto_feasible(qp.coarse, within, on)
-            if found.missing > HELD:
+            lam, _ = project_onto_feasible(qp.coarse, within, on)
+            if imbalance(qp.coarse, lam) > HELD:
                 return None
-            lam, on = found.lam, 0.5 * (on + found.lam)
+            on = 0.5 * (on + lam)
             self._enter(qp.feasible.face(on, s))
         return qp.at(lam)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
-from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
 # far more than what factors leave of Gλ = e
@@ -46,41 +46,33 @@ class ProjectionParameters:
 DEFAULT = ProjectionParameters()
 
 
-@dataclass(frozen=True)
-class FeasiblePoint:
-    """A point of Ω, and how far it is from Gλ = e."""
-
-    lam: Array  # the point, this rank's part
-    alpha: Array  # λ = P_Ω(y + Gᵀα), replicated
-    missing: float  # how far Gλ is from e: the worst entry beside its terms, 1 at most
-
-
 def project_onto_feasible(
     coarse: Coarse,
     feasible: FeasibleSet | WithinFace,
     y: Array,
     parameters: ProjectionParameters = DEFAULT,
-) -> FeasiblePoint:
+) -> tuple[Array, Array]:
     """Project y onto {λ ∈ Ω, Gλ = e}, or come as close to that set as possible. Collective.
 
     It is λ(α) = P_Ω(y + Gᵀα) with Gλ(α) = e. That is where the convex function
     ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
     line search finds: each step factors G_f G_fᵀ, f the face of λ(α). Where nothing in Ω fulfils
     Gλ = e, the cost falls without end along steps that no row stops; a few of them end it, and
-    ``missing`` says so.
+    ``imbalance`` of λ says so. Return this rank's part of λ, and α, which all ranks have.
 
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> coarse = DenseCoarse(np.ones((1, 2)), np.ones(1))
-    >>> project_onto_feasible(coarse, Bounds(), np.array([1.0, -1.0])).lam.tolist()
+    >>> project_onto_feasible(coarse, Bounds(), np.array([1.0, -1.0]))[0].tolist()
     [1.0, 0.0]
     """
     comm = coarse.comm
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension))
     damping, trials, unmet, slowly, least = parameters.damping, 1, 0, 0, trial.left
     while trials < parameters.max_trials and unmet < parameters.patience:
-        scale = float(np.linalg.norm(coarse.terms(trial.lam) + np.abs(coarse.e)))
+        terms = coarse.terms(trial.lam) + np.abs(coarse.e)
+        scale = float(np.sqrt(terms @ terms))
         if bcast_from_root(comm, trial.left <= parameters.balanced * scale):
             break
         face = feasible.face(trial.lam, trial.lam - trial.z)
@@ -102,7 +94,7 @@ def project_onto_feasible(
             break
         if slow:
             damping = parameters.least_damping
-    return FeasiblePoint(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
+    return trial.lam, trial.alpha
 
 
 class WithinFace:

@@ -25,40 +25,34 @@ class RecyclingParameters:
 
 
 class DirectionStore:
-    """Directions p of energy pᵀFp = 1 and their images, as rows; this rank's part.
+    """Directions p of energy pᵀFp = 1 and their images; this rank's part.
 
     Of more than ``capacity`` directions the oldest goes; ``count`` is their number, and ``changes``
-    says how often they have changed.
+    says how often they have changed. They are in no order the rows of ``directions``, of shape
+    ``(count, m)``, and those of ``images`` their images.
     """
 
     def __init__(self, capacity: int, size: int) -> None:
-        self.capacity, self.count, self._next, self.changes = capacity, 0, 0, 0
-        self._rows: Array = np.zeros((2, 0, size))
+        self.capacity, self.changes = capacity, 0
+        self._hold(np.zeros((2, 0, size)))
 
-    @property
-    def directions(self) -> Array:
-        """Directions, in no order, shape ``(count, m)``."""
-        return np.asarray(self._rows[0, : self.count])
-
-    @property
-    def images(self) -> Array:
-        """Their images, likewise."""
-        return np.asarray(self._rows[1, : self.count])
+    def _hold(self, rows: Array, count: int = 0, following: int = 0) -> None:
+        """Take directions and images, ``(2, room, m)``, the first ``count`` of which are filled."""
+        self._rows, self.count, self._next, self.changes = rows, count, following, self.changes + 1
+        self.directions, self.images = rows[:, :count]
 
     def put(self, p: Array, image: Array) -> None:
         """Store another direction."""
-        room = self._rows.shape[1]
-        if self._next == room:
-            more = min(max(room, 8), self.capacity - room)
-            more_rows = np.zeros((2, more, self._rows.shape[2]))
-            self._rows = np.concatenate((self._rows, more_rows), axis=1)
-        self._rows[0, self._next], self._rows[1, self._next] = p, image
-        self.count = max(self.count, self._next + 1)
-        self._next, self.changes = (self._next + 1) % self.capacity, self.changes + 1
+        rows, at = self._rows, self._next
+        if at == rows.shape[1]:
+            more = min(max(at, 8), self.capacity - at)
+            rows = np.concatenate((rows, np.zeros((2, more, rows.shape[2]))), axis=1)
+        rows[0, at], rows[1, at] = p, image
+        self._hold(rows, max(self.count, at + 1), (at + 1) % self.capacity)
 
     def clear(self) -> None:
         """Drop all directions."""
-        self.count, self._next, self.changes = 0, 0, self.changes + 1
+        self._hold(self._rows)
 
 
 class Recycled(DirectionStore):
@@ -85,7 +79,8 @@ class Recycled(DirectionStore):
         Where images are no longer right, all that was kept is forgotten. Three reductions.
         """
         x, Fx = x / np.sqrt(energy), Fx / np.sqrt(energy)
-        self._rows = self._rows if self.count else np.zeros((2, 0, len(x)))
+        if not self.count:
+            self._hold(np.zeros((2, 0, len(x))))
         for passed in range(2):
             W, FW = self.directions, self.images
             a, same = summed(self.comm, np.array([FW @ x, W @ Fx]))
@@ -113,15 +108,13 @@ class Recycled(DirectionStore):
         So they lie from then on: who takes them adds what it adds in the same order.
         """
         if self.count == self.capacity:
-            self._rows, self._next = np.roll(self._rows, -self._next, axis=1), 0
-            self.changes += 1
+            self._hold(np.roll(self._rows, -self._next, axis=1), self.count)
         return np.array(self._rows[:, : self.count].transpose(0, 2, 1))
 
     def take(self, kept: Array) -> None:
         """Restore another run's directions, the newest ones if they are too many."""
         newest = kept[:, :, max(kept.shape[2] - self.capacity, 0) :]
-        self.clear()
-        self._rows = np.zeros((2, 0, newest.shape[1]))
+        self._hold(np.zeros((2, 0, newest.shape[1])))
         for w, Fw in zip(newest[0].T, newest[1].T, strict=True):
             self.put(w, Fw)
 

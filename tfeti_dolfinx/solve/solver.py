@@ -187,6 +187,8 @@ def conclude(
     on which bounds of friction change most, and whether it slides; an error says ``warnings``, too.
     Raise a ConvergenceError where it stopped before its tolerance, unless options turn that off.
     """
+    if result.reason > 0 and not options.converged_reason:
+        return
     contacts = f", those of {' and '.join(excluding)}" if excluding else ""
     body, slides = restless
     explanation = EXPLANATIONS.get(result.reason, "")

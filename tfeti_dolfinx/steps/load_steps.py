@@ -370,9 +370,10 @@ class LoadSteps:
     def _record(self, number: int, t: float, size: float) -> StepRecord:
         report, solution = self._problem.report, self._problem.solution
         lost = self._comm.allreduce(float(np.sum(solution.dissipation)))
-        contacts = [solution.contact(i) for i in range(len(solution.contacts))]
-        # of bodies with mass they have blows, too
-        forces = report.contact_forces or [list(c.resultant.force) for c in contacts]
+        forces: list[Any] = report.contact_forces  # of bodies with mass they have blows, too
+        if not forces:
+            which = range(len(solution.contacts))
+            forces = [solution.contact(i).resultant.force for i in which]
         tools: dict[str, float] = {}
         for i in range(len(solution.tool_motions)):
             tools |= solution.tool(i).numbers

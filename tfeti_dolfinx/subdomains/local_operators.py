@@ -113,7 +113,8 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 
     rows = [np.searchsorted(trace, own) for own in traces]
     work = 4.0 * stiffness.entries
-    return _group(equal, rows, len(trace), partial(_in_chunks, apply), work)
+    chunks = apply if len(equal) <= TOGETHER else partial(_in_chunks, apply)
+    return _group(equal, rows, len(trace), chunks, work)
 
 
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
