@@ -251,7 +251,7 @@ def contact(made, qp_type, options):
     row = {
         "solver": f"contact, {qp_type}",
         "setting": f"rtol {problem.options.number:.0e}",
-        "steps": f"{report.F_multiplications} F + {report.preconditioner_multiplications} S",
+        "steps": f"{report.iterations} F + {report.preconditioner_steps} S",
         "set-up": seconds["subdomains"],
         "solve": seconds["dual"] + seconds["qp"],
         "all": solve_seconds({"seconds": seconds}),

@@ -84,8 +84,8 @@ def bandwidth(ranks):
 def costs(report):
     """Columns that all studies have."""
     return {
-        "F": report["F_multiplications"],
-        "S": report["preconditioner_multiplications"],
+        "F": report["iterations"],
+        "S": report["preconditioner_steps"],
         **stage_seconds(report),
         "without mesh": solve_seconds(report),
         "processor": report["processor"],

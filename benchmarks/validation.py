@@ -80,13 +80,13 @@ class Row:
 def work(problem: tfeti.ContactProblem) -> int:
     """Multiplications of the last solve."""
     report = problem.report
-    return report.F_multiplications + report.preconditioner_multiplications
+    return report.iterations + report.preconditioner_steps
 
 
 def in_all(report: tfeti.Report) -> int:
     """Multiplications of all solves."""
     counted = report.in_all
-    return counted["F_multiplications"] + counted["preconditioner_multiplications"]
+    return counted["iterations"] + counted["preconditioner_steps"]
 
 
 # --- Meshes and forms -------------------------------------------------------------------------

@@ -165,9 +165,9 @@ if len(touching):
     errors["duration"] = float((last - start) * size / hertz_lasts - 1)
 problem.report.errors.update(errors)
 if comm.rank == 0:
-    F = [record.figures["F_multiplications"] for record in records]
+    F = [record.figures["iterations"] for record in records]
     motion = [record.motion for record in records]
-    print(f"{len(records)} steps of {size:.4g}, multiplications {sum(F)}")
+    print(f"{len(records)} steps of {size:.4g}, {sum(F)} iterations")
     print(f"median {np.median(F):g}, at most {max(F)} in a step")
     for name in ("load", "contact", "friction", "predictor"):
         print(f"work of {name:<10} {sum(m[name] for m in motion):.4g}")

@@ -128,14 +128,14 @@ def test_the_sample_of_a_report_is_what_a_demo_prints(quick_demo, serial_only):
     for pattern in (force, pressure):
         numbers = [float(re.search(pattern, lines[2])[1]) for lines in (said, printed)]
         assert numbers[0] == pytest.approx(numbers[1], rel=0.01)
-    for pattern in (r"(\d+) F", r"(\d+) S"):
+    for pattern in (r"(\d+) iterations", r"(\d+) preconditioned"):
         numbers = [int(re.search(pattern, lines[4])[1]) for lines in (said, printed)]
         assert abs(numbers[0] - numbers[1]) <= 5
 
 
 # what is no figure: names, dimensions, status and codes, what a page gives to a program or states
 GIVEN = [
-    r"(io4dolfinx|adios4dolfinx|scifem|setuptools ≥|beside) [\d.]+\d( and [\d.]+\d)?",
+    r"(io4dolfinx|adios4dolfinx|scifem|setuptools ≥|import with) [\d.]+\d( and [\d.]+\d)?",
     r"io4dolfinx|adios4dolfinx|h5py",
     r"\b[1-3]D\b",
     r"[Dd]egrees? [12](?: and 2)?\b",

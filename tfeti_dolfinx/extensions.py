@@ -56,7 +56,8 @@ class Extensions:
             the arguments of ``Subdomains``.
         preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, for solvers that
             take one.
-        deflation: Makes the coarse space of the preconditioner on faces; default ``SoftModes``.
+        deflation: Makes the coarse space of the preconditioner on active sets; default
+            ``SoftModes``.
         feasible_set: From B and c to the set of multipliers, asked before each run of the solver;
             ``check_feasible_set`` tests it.
         monitor: Called after each step of the solver.
@@ -149,7 +150,7 @@ def _on_all_rows(law: FeasibleLaw) -> FeasibleLaw:
         if projected != zero.shape:
             raise InputError(
                 f"extensions: feasible_set projects vectors of shape {zero.shape} to {projected}; "
-                "expected a set on all rows of this rank, say a Product of sets on "
+                "expected a set on all constraints of this rank, say a Product of sets on "
                 "constraints.sets.normals"
             )
         tangents = constraints.sets.tangents

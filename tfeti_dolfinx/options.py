@@ -39,7 +39,7 @@ LOOSEST = 1e-2
 
 # mechanisms that are on by default, by the names that -tfeti_without takes
 MECHANISMS = {
-    "d_scaling": "rows of B weighted by the diagonal of K, not by the number of copies",
+    "d_scaling": "constraints weighted by the diagonal of K, not by the number of copies",
     "smooth_displacements": "displacements with given jumps made smooth in the preconditioner",
     "soft_springs": "motions that springs hold softly as a coarse space of the preconditioner",
     "kept_directions": "directions of PCPG conjugate to all before, not to the last one alone",
@@ -67,8 +67,8 @@ class Options:
     rtol: float | str = described(
         1e-6,
         "all",
-        "stop when the displacement of each body is right to this, in the maximum norm; auto: to "
-        "1e-2, and when the algebraic error in energy is a tenth of the discretisation error",
+        "stop when the displacement of each body is accurate to this, in the maximum norm; auto: "
+        "to 1e-2, and when the algebraic error in energy is a tenth of the discretisation error",
         fits=Range("0 or more, less than 1", lambda value: 0.0 <= value < 1.0),
         words=("auto",),
     )
@@ -79,7 +79,7 @@ class Options:
     pc_type: str = described(
         "auto",
         "all",
-        "preconditioner, with contact on the free rows alone; auto takes dirichlet, after steps of "
+        "preconditioner, on the active set; auto takes dirichlet, after steps of "
         "lumped where subdomains are large, and none with smalse",
         choices=("none", *PRECONDITIONERS),
     )
@@ -97,7 +97,7 @@ class Options:
         "each, or by one factor or matrix for all that are equal; auto counts operations",
         choices=LOCAL_TYPES,
     )
-    local_multiplications: int = described(
+    local_iterations: int = described(
         50, "subdomains", "iterations to expect, for that count", fits=FROM_0
     )
     clusters: int = described(
@@ -120,7 +120,7 @@ class Options:
     friction_type: str = described(
         "auto",
         "coulomb",
-        "Newton's method on Coulomb's law itself, problems with given bounds where it fails; or "
+        "Newton's method on Coulomb's law itself, problems with Tresca's bounds where it fails; or "
         "these alone, as a fixed point; auto takes newton with that as qp_type, else fixed_point",
         choices=("auto", "newton", "fixed_point"),
     )
@@ -134,7 +134,7 @@ class Options:
     friction_max_it: int = described(
         50,
         "coulomb",
-        "most problems with given friction bounds that are solved for Coulomb's law",
+        "most problems with Tresca's bounds that are solved for Coulomb's law",
         fits=FROM_1,
     )
     newton: NewtonParameters = NewtonParameters()
@@ -157,7 +157,7 @@ class Options:
 
     @property
     def number(self) -> float:
-        """rtol as a number: what displacements have to be right to."""
+        """rtol as a number: how accurate displacements have to be."""
         return LOOSEST if isinstance(self.rtol, str) else self.rtol
 
     def view_text(self, prefix: str) -> str:

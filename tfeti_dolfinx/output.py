@@ -43,7 +43,7 @@ def write_vtx(
     Nodal fields (displacement, pressure, gap, status, with mass velocity, with contacts traction,
     with friction tangential traction and slip, with a stress
     stress and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
-    material, and the discretisation error if it has been estimated) to a second file beside it,
+    material, and the discretisation error if it has been estimated) to a second file,
     ``<stem>_cells.bp``.
 
     Args:

@@ -76,14 +76,14 @@ def plot_deformed(
             the contact pressure; "status", whether contact is open, slips or sticks; "bodies".
         unit: Of the stress or the pressure, for the scale.
         factor: Displacements are drawn times this; default 1 where there are contacts (bodies
-            would seem to enter each other), else such that the largest is 5 % of the scene.
+            would seem to enter each other), else such that the largest is 5 % of their size.
         zoom: Camera zoom.
         focus: Point that the camera looks at.
         show_edges: Whether to draw cell edges; default where there are at most 3000 cells.
         show_obstacles: Whether to draw obstacles, which may hide what is behind them.
         highest: Value of the strongest colour; default of a stress that which 0.5 % of the nodes
             are above, of a pressure the largest.
-        view: Direction from the scene to the camera, z upwards; default pyvista's.
+        view: Direction from the bodies to the camera, z upwards; default pyvista's.
         cut: A point and a normal: what lies beyond that plane, before it moved, is cut away.
 
     Returns:

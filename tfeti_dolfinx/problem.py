@@ -253,7 +253,7 @@ class ContactProblem:
                 if new == 0:
                     return
             system.change("rows")
-            self._counts.late_contact_rows += new
+            self._counts.late_constraints += new
         raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
 
     def _solve_rows(self) -> tuple[Solution, float]:
@@ -349,7 +349,7 @@ class ContactProblem:
             The estimates, which ``report`` then has, too, with a warning where they are of no use.
 
         Raises:
-            InputError: There is no solution, or its rows are no longer there.
+            InputError: There is no solution, or its constraints have changed.
             FactorError: A matrix could not be factored.
         """
         self._meet("estimate")
@@ -370,15 +370,15 @@ class ContactProblem:
 
         Not needed where constants, functions or Dirichlet values have only got other values:
         ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
-        new load, new values or new gaps need no row and no factor, a new stiffness no search:
-        with ``secondary="auto"`` the sides of a pair stay those of the first stiffness.
+        new load, new values or new gaps need no constraints and no factor, a new stiffness no
+        search: with ``secondary="auto"`` the sides of a pair stay those of the first stiffness.
 
         Args:
             load: A linear form instead of ``L``.
             values: Dirichlet conditions instead of ``bcs``.
             stiffness: A bilinear form on the same space instead of ``a``.
-            gap: For contacts, by position or name, what their ``gap=`` is from now on. Rows stay;
-                nodes that have none and come to overlap get theirs, as ever.
+            gap: For contacts, by position or name, what their ``gap=`` is from here on. Nodes
+                without a constraint that come to overlap get theirs.
 
         Raises:
             InputError: Something given does not fit; the message names it. Nothing has changed.

@@ -269,8 +269,8 @@ class SavedState:
             expected = (records.contact, of_groups[records.group], records.within_reach)
             if not same or not all(map(np.array_equal, found, expected)):
                 raise InputError(
-                    "the state has other contact rows than the problem: expected the contacts, "
-                    "conditions and data that it was found with"
+                    "the state has other contact constraints than the problem: expected the "
+                    "contacts, conditions and data that it was found with"
                 )
         return state
 

@@ -80,7 +80,7 @@ class Solution(ContactState):
 
     Attributes:
         u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-        lam: Multipliers of this rank's rows.
+        lam: Multipliers of this rank's constraints.
         boundary: What boundary elements know of it, if there are any: ``values_at``, which gives
             rows as ``value_row``, and ``finite``, the cells of this rank without them.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
@@ -138,7 +138,7 @@ class Solution(ContactState):
 
         Args:
             points: The same on all ranks, shape ``(k, gdim)``. On the surface of boundary elements
-                the displacement is that of their nodes, and the stress that of a point beside it.
+                the displacement is that of their nodes, and the stress that of a point next to it.
 
         Raises:
             InputError: The points are of another shape, or not finite.

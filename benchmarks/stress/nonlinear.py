@@ -478,7 +478,7 @@ def _solved(scene: Scene, row: dict[str, Any]) -> str:
             advance(middle, end, halvings + 1)
             return
         problem.accept()
-        row["F"] += problem.report.F_multiplications
+        row["F"] += problem.report.iterations
         row["newton"] += problem.report.newton_steps
         tool, force = np.zeros(scene.gdim), None
         if scene.kind in ("tool", "force"):

@@ -56,7 +56,7 @@ RUN = {
         block=lambda data: None
     ),
     r"extensions: feasible_set projects vectors of shape \(\d+,\) to \(\d+,\); expected a set "
-    r"on all rows of this rank": own(feasible_set=lambda constraints: OfThree()),
+    r"on all constraints of this rank": own(feasible_set=lambda constraints: OfThree()),
     r"extensions: feasible_set leaves multipliers of friction free": normals_alone,
     r"extensions: monitor: ZeroDivisionError: no such place": own(monitor=on_the_last_rank),
 }

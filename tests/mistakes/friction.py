@@ -75,7 +75,7 @@ AT_NODES = {
     r"^sand: the same surface has another law of friction in ice; expected one law": lambda s: (
         s.with_contacts(rough(s, 1.0, name="ice"), rough(s, 2.0, name="sand"))
     ),
-    r"-tfeti_qp_type pcpg: the scene has friction, \d+ tangential rows, which PCPG cannot "
+    r"-tfeti_qp_type pcpg: the model has friction, \d+ tangential constraints, which PCPG cannot "
     r"keep; expected auto or smalse or newton": lambda s: s.with_contacts(
         rough(s, 1.0), qp_type="pcpg"
     ),

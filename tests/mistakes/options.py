@@ -31,7 +31,7 @@ OPTIONS = {
     r"-tfeti_rtol 'tight': expected a value of type float": given(tfeti_rtol="tight"),
     r"-tfeti_max_it 2.7: expected a value of type int": given(tfeti_max_it=2.7),
     r"-tfeti_qp_type newt: expected one of auto, pcpg, smalse, newton": given(tfeti_qp_type="newt"),
-    r"-tfeti_qp_type pcpg: the scene has \d+ contact rows, which PCPG cannot keep": lambda s: (
+    r"-tfeti_qp_type pcpg: the model has \d+ contact constraints, which PCPG": lambda s: (
         s.with_contacts(s.floor, tfeti_qp_type="pcpg")
     ),
     r"petsc_options: -tfeti_rtol is there twice": lambda s: s.problem(

@@ -158,7 +158,7 @@ class Diagnostics:
         if worst > LIMITS.flat:
             yield (
                 f"cells: the flattest is about {2.0 * worst:.0e} times as long as thick; forces "
-                "and multiplications suffer from more than 10"
+                "and iterations suffer from more than 10"
             )
 
     def _hinges(self) -> Iterator[str]:

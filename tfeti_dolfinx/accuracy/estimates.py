@@ -28,13 +28,13 @@ class Estimates:
 
     Attributes:
         energy: ‖u‖_K, a root of an energy.
-        algebraic: Bound of ‖u − u*‖_K, u* the exact solution of the discrete problem: its rows,
-            and the last bounds of friction. Infinite where no forces balance the load.
+        algebraic: Bound of ‖u − u*‖_K, u* the exact solution of the discrete problem: its
+            constraints, and the last bounds of friction. Infinite where no forces balance the load.
         discretisation: Estimate of ‖u* − ū‖_K, ū the exact solution of the continuous problem;
             None if the problem was given no stress. ``Solution.discretisation_error`` has its
             parts.
         factorizations: Subdomain matrices factored for it.
-        lifting_multiplications: Multiplications by S, the Schur complements.
+        lifting_steps: Applications of S, the Schur complements.
         recoveries: Displacements recovered, each for one more solve in every subdomain.
         seconds: Wall seconds of this rank.
     """
@@ -43,7 +43,7 @@ class Estimates:
     algebraic: float
     discretisation: float | None
     factorizations: int
-    lifting_multiplications: int
+    lifting_steps: int
     recoveries: int
     seconds: float
 
@@ -69,7 +69,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
     """
     if solution.gluing.constraints is not system.gluing.constraints:
         raise InputError(
-            "estimate: the rows are no longer those of the solution; expected a call after solve()"
+            "estimate: the constraints are not those of the solution; expected a call after solve()"
         )
     dual, u = system.dual, system.subdomains.with_rigid(solution.u)
     comm, counters = dual.coarse.comm, dual.subdomains.counters
@@ -85,7 +85,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
         algebraic=bound.error,
         discretisation=float(discretisation) if solution.has_stress else None,
         factorizations=comm.allreduce(counters.factorizations - factored),
-        lifting_multiplications=1,
+        lifting_steps=1,
         recoveries=int(bound.moved > 0.0),
         seconds=perf_counter() - start,
     )
@@ -113,6 +113,6 @@ def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
         "energy": last.energy,
         "algebraic": last.bound.error,
         "discretisation": last.goal,
-        "lifting_multiplications": len(reached),
+        "lifting_steps": len(reached),
         "recoveries": sum(look.bound.moved > 0.0 for look in reached),
     }

@@ -266,8 +266,8 @@ def law_of(K: Any, surface: Surface, name: str) -> IsotropicLaw:
     most = TOLERANCES.same * np.max(abs(K) @ np.abs(moved))
     if not (law.mu > 0.0 and -1.0 < law.nu < 0.5 and np.abs(forces - expected).max() <= most):
         raise InputError(
-            f"{name}: boundary elements need one homogeneous, isotropic law, and nothing beside "
-            "it such as springs or masses; the bilinear form has something else there. Expected "
+            f"{name}: boundary elements need one homogeneous, isotropic law, without "
+            "springs or masses; the bilinear form has something else there. Expected "
             "constant moduli, or finite elements for this volume"
         )
     return law

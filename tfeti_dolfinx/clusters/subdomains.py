@@ -356,8 +356,8 @@ class Saddle:
             self._T = cholesky(self._M.T @ self._M + self._free @ self._free.T, lower=True)
         except np.linalg.LinAlgError as error:
             raise FactorError(
-                "rounding makes averages of faces in a cluster depend on each other, as in thin "
-                "parts; expected -tfeti_clusters 0, thicker parts or fewer subdomains"
+                "rounding makes averages over interfaces in a cluster depend on each other, as in "
+                "thin parts; expected -tfeti_clusters 0, thicker parts or fewer subdomains"
             ) from error
 
     def solve(self, s: Array) -> Array:

@@ -46,7 +46,7 @@ class ContactStatus(IntEnum):
 
 @dataclass(frozen=True)
 class ContactData:
-    """State of the conditions of one contact on this rank, one row per node.
+    """State of the conditions of one contact on this rank, one entry per node.
 
     A node is on one rank only: sums over all ranks are those of the contact.
 
@@ -56,8 +56,8 @@ class ContactData:
             the contact pushes it with −force·normal, shape ``(n, gdim)``.
         force: Normal force on the node, 0 or more, shape ``(n,)``.
         pressure: Force over area, shape ``(n,)``.
-        area: ∫φ_i of the node's hat over the surface, of a pair over what the other side covers,
-            times the thickness, shape ``(n,)``.
+        area: ∫φ_i of the node's shape function over the surface, of a pair over what the other
+            side covers, times the thickness, shape ``(n,)``.
         gap: Remaining distance, shape ``(n,)``.
         status: ContactStatus: OPEN without a normal force, else TOUCHING; with friction SLIP or
             STICK, shape ``(n,)``.

@@ -84,7 +84,7 @@ class FrictionLaw:
 
 @dataclass(frozen=True)
 class Tresca(FrictionLaw):
-    """The tangential traction is at most a given bound, whatever the pressure is.
+    """The tangential traction is at most a bound, whatever the pressure is.
 
     It acts on all nodes with a contact condition within reach, open ones as well, and on those
     whose normal displacement is prescribed.

@@ -235,7 +235,7 @@ class Obstacle(ContactPartner):
             show ("curved" is the same); or what replaces it, however far the shape is (negative:
             interference): a number, or a function of the vertices, shape ``(3, n)``.
         friction: ``Tresca``, ``Coulomb``, or None.
-        reach: Nodes farther than this from the obstacle get no row at first. After the solve
+        reach: Nodes farther than this from the obstacle get no constraint at first. After the solve
             all are checked, and those that came to overlap get theirs. Default: 5 % of the
             surface's extent.
         name: For messages and ``solution.contact(name)``. Default: "obstacle of surface 'a'".
@@ -272,8 +272,8 @@ class Obstacle(ContactPartner):
 
         With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex (or the gap that is
         given), the condition is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i.
-        Of a displacement of degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to its
-        hats.
+        Of a displacement of degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to the
+        shape functions.
         """
         facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface))
         kind = facet_kind(dofs)
@@ -347,8 +347,8 @@ class Contact(ContactPartner):
             distance where it is at most the reach (negative: interference): a number, or a
             function of the secondary surface's vertices, shape ``(3, n)``.
         friction: ``Tresca``, ``Coulomb``, or None.
-        reach: Surfaces farther apart than this make no rows at first; those that have come to
-            overlap after the solve get theirs, and the solve goes on. Default: 5 % of the smaller
+        reach: Surfaces farther apart than this make no constraints at first; those that overlap
+            after the solve get theirs, and the solve goes on. Default: 5 % of the smaller
             surface's extent.
         name: For messages and ``solution.contact(name)``. Default: "contact of 'a' with 'b'".
 

@@ -93,13 +93,13 @@ def rotation_vector(motion: Array, gdim: int) -> Array:
 class RigidBody:
     """A rigid tool: a shape that moves by a law, or under a force.
 
-    It stands in the place of an obstacle's shape. Motions are translations ``"x"``, ``"y"``,
+    It takes the place of an obstacle's shape. Motions are translations ``"x"``, ``"y"``,
     ``"z"`` and turns about axes through ``point``: ``"rz"`` in 2D, ``"rx"``, ``"ry"``, ``"rz"``.
     Those in ``free`` are found, so that contact balances force and moment; others are those of
     the law. Surfaces that touch it are its bearings: a tool of several obstacles is one body.
 
     Numbers may be fixed, a ``dolfinx.fem.Constant``, or a function of ``ContactProblem.time``,
-    which ``LoadSteps`` sets. Another value needs neither rows nor factors.
+    which ``LoadSteps`` sets. Another value needs neither constraints nor factors.
 
     Args:
         shape: Its shape where the motion is 0: as of an ``Obstacle``.
@@ -111,7 +111,7 @@ class RigidBody:
         free: Names of the motions that are free.
         point: Default the centre or the point of the shape, else the origin.
         name: For messages and ``solution.tool(name)``. Default: "tool of surface 'a'".
-        large: Whether its motion is not small beside the shape's size: then its shape is placed
+        large: Whether its motion is not small compared with the shape: then its shape is placed
             where the law has it before each solve, and contact is searched there. Else gaps change
             with the motion, and normals stay.
 

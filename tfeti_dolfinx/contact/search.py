@@ -181,7 +181,7 @@ class ContactSearch:
         before, self.said = self.said, unmet
         for contact in self.said:
             if self._dofs.comm.rank == 0 and contact not in before:
-                log.warning("contact %s has met nobody, and has no rows", contact)
+                log.warning("contact %s has nothing within reach, and no constraints", contact)
 
     def _approach(self, contact: ContactPartner, u: Array) -> float:
         """Bound how much nearer two surfaces have come, 0 of an obstacle, the same on all ranks.

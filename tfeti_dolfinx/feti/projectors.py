@@ -245,7 +245,7 @@ class ObliqueProjectors:
                     H = _scaled(A + N, self._scale, pinned)
                     self._factor = splu(H.csr().tocsc())
             except RuntimeError as error:
-                raise FactorError(f"the coarse problem of a face with friction: {error}") from error
+                raise FactorError(f"active set with friction: coarse problem: {error}") from error
 
     def _solve(self, y: Array) -> Array:
         """H⁺y without null modes, for y orthogonal to them; shape ``(r,)`` or ``(r, q)``."""
@@ -283,5 +283,5 @@ class FaceFactors:
     def factor(self, gram: csr_array, kind: str = "face") -> SemidefiniteFactor:
         """Return a factor of a Gram matrix, or raise a FactorError. Collective."""
         self.count[kind] += int(gram.shape[0] > 0)
-        what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'rows of a face'}"
+        what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'active set'}"
         return SemidefiniteFactor(gram, self.null, self.comm, what, self.prefix)

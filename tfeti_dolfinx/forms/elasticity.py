@@ -173,7 +173,7 @@ class Elasticity:
             u: Trial function.
             v: Test function.
             dx: Measure of cells. By default all cells, with quadrature that is exact on affine
-                cells (but for 1/r), and dear nowhere: UFL's own estimate is dearer on hexahedra.
+                cells (but for 1/r), and cheap: UFL's own estimate is more expensive on hexahedra.
 
         Raises:
             InputError: As ``strain``.

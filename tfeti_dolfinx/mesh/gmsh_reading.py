@@ -286,7 +286,7 @@ def read_gmsh(
         source: A ``.msh`` file, or a gmsh model (``gmsh.model``) that is meshed on rank 0.
         comm: Communicator of the torn mesh.
         subdomains: Their number; or one id per cell on rank 0, in gmsh's order, and empty arrays
-            elsewhere (for split files one id per cell of the files that this rank reads, in the
+            on others (for split files one id per cell of the files that this rank reads, in the
             order of the files and within a file in gmsh's order, without ghost cells); or a
             callable of cell midpoints, shape ``(3, n)``. Default: gmsh's own partitions if the
             mesh has them (split files: one subdomain per file), else about 4000 unknowns each.

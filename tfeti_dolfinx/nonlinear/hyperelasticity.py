@@ -97,7 +97,7 @@ class Hyperelasticity(ABC):
 class NeoHooke(Hyperelasticity):
     """Compressible neo-Hooke: ψ = μ/2 (tr FᵀF − 3 − 2 ln J) + λ/2 ln²J, J = det F.
 
-    Its moduli are 2(μ − λ ln J), beside λ tr², and so indefinite where a body is dilated far.
+    Its moduli are 2(μ − λ ln J), compared with λ tr², so indefinite where a body is dilated far.
     Arguments are those of ``Hyperelasticity``.
     """
 

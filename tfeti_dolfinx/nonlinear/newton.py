@@ -30,7 +30,7 @@ class NewtonTolerances:
             that of a kept tangent a new one would be solved to more than it moves.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
-        nowhere: Of the length of the scene, in finite strain: less is rounding of where bodies are.
+        nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
         final: Share of ``rtol`` to which the last linearised problems are solved at least, so that
             increments can fall below ``rtol``.
         curvature: A step is shortened where the residual along it, contact forces included, has
@@ -58,7 +58,7 @@ class NewtonTolerances:
         turned: Angle by which a body is turned to see whether F is one of finite strain.
         alike: Of the residual of a stretch: residuals nearer to each other are the same.
         other: Anderson's acceleration begins anew where an increment is so many times the last
-            one, as with rows of new places.
+            one, as with constraints of new places.
     """
 
     max_it: int = 50

@@ -42,8 +42,9 @@ class NonlinearContactProblem(ContactProblem):
 
     1. *Model.* Assemble J(u); in small strain keep it, with its factors, where the last step was
        short and in line with it, and from one load step to the next; in finite strain, with the
-       rows of the same places, until the increments are small beside the first one, unless places
-       matter more. Solve the contact problem for û, to the forcing term of Eisenstat and Walker.
+       constraints of the same places, until the increments are small compared with the first,
+       unless places matter more. Solve the contact problem for û, to the forcing term of
+       Eisenstat and Walker.
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
        gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0) is the remainder.

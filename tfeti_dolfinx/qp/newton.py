@@ -37,7 +37,7 @@ class NewtonParameters:
     gamma: float = described(
         1.0,
         "newton",
-        "Γ of the proportioning test between two faces",
+        "Γ of the proportioning test between two active sets",
         name="newton_gamma",
         symbol="Γ",
         fits=ABOVE_0,
@@ -45,7 +45,7 @@ class NewtonParameters:
     reduction: float = described(
         0.5,
         "newton",
-        "what a solve on a face that may change reduces its residual to, in (0, 1)",
+        "what a solve on an active set that may change reduces its residual to, in (0, 1)",
         name="newton_reduction",
         fits=Range("between 0 and 1", lambda value: 0.0 < value < 1.0),
     )

@@ -335,7 +335,7 @@ class PrintMonitor:
     def __call__(
         self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
     ) -> None:
-        """Print outer iteration, step, ‖g^P‖, ‖Qx‖ if known, touching rows, multiplications."""
+        """Print outer iteration, step, ‖g^P‖, ‖Qx‖ if known, touching constraints, iterations."""
         face = self.feasible.face(x, np.zeros(len(x)))
         own = int(np.sum((face.status != Status.FREE) & face.carrying))
         touching = self.comm.allreduce(own)
@@ -344,6 +344,6 @@ class PrintMonitor:
             print(
                 f"{steps.outer:4d} {step:<13s} |gP| {projected_gradient:.4e}  "
                 f"|Qx| {known}  touching {touching:6d}  "
-                f"multiplications {self.multiplications():5d}",
+                f"iterations {self.multiplications():5d}",
                 flush=True,
             )

@@ -219,7 +219,7 @@ class Product:
         )
         if np.any(count > 1):
             raise InputError(
-                f"Product: row {rows[count > 1][0]} stands in two sets; expected one at most"
+                f"Product: constraint {rows[count > 1][0]} stands in two sets; expected one at most"
             )
 
     def project(self, x: Array) -> Array:

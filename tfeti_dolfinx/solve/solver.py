@@ -34,14 +34,14 @@ from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
-    "larger rtol, or a scene with smaller ratios of stiffness or size",
+    "larger rtol, or a model with smaller ratios of stiffness or size",
     ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
     ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest, "
     "least of all on the body {restless!r}: "
     "expected a smaller coefficient, smaller load steps, a larger friction_max_it, or a load that "
     "does not need bodies wedged between others",
-    ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
-    "other{contacts}: expected gaps that some displacement keeps",
+    ConvergedReason.DIVERGED_CONTRADICTION: "; contact constraints that depend on each other "
+    "exclude each other{contacts}: expected gaps that some displacement keeps",
 }
 # in the place of that of DIVERGED_FRICTION
 SLIDES = (
@@ -63,10 +63,10 @@ def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
         qp_type = AUTO[num_inequalities + num_tangents > 0]
     if num_inequalities + num_tangents > 0 and not SOLVERS[qp_type].keeps_sets:
         able = ["auto", *(name for name, solver in SOLVERS.items() if solver.keeps_sets)]
-        tangential = f"friction, {num_tangents} tangential rows,"
-        rows_of = tangential if num_tangents else f"{num_inequalities} contact rows,"
+        tangential = f"friction, {num_tangents} tangential constraints,"
+        rows_of = tangential if num_tangents else f"{num_inequalities} contact constraints,"
         raise InputError(
-            f"-{prefix}qp_type {qp_type}: the scene has {rows_of} which {qp_type.upper()} "
+            f"-{prefix}qp_type {qp_type}: the model has {rows_of} which {qp_type.upper()} "
             f"cannot keep; expected {' or '.join(able)}"
         )
     own = SOLVERS[qp_type].pc_type

@@ -393,7 +393,7 @@ class ContactDynamics(ContactProblem):
         """Put energies, work and forces into the report."""
         motion = balance(self._forms_in_time, self._system.dual, self.solution)
         if self._predictor is not None:
-            motion["predictor_multiplications"] = float(self._predictor.multiplications)
+            motion["predictor_iterations"] = float(self._predictor.multiplications)
         contact, forces = self.solution.gluing.records.contact, self.solution.condition_forces
         total = summed(self.dofs.comm, sum_rows(contact, forces, len(self.contacts)))
         means = [[float(component) for component in force] for force in total]
@@ -403,12 +403,12 @@ class ContactDynamics(ContactProblem):
 class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
     """Nonlinear bodies with mass in contact, step by step, in small or in finite strain.
 
-    Steps are those of ``ContactDynamics``, with the residual F in the place of K: M(v⁺ − v)/τ =
+    Steps are those of ``ContactDynamics``, with the residual F instead of K: M(v⁺ − v)/τ =
     −(F(u) + F(u⁺))/2 − Bᵀλ, u⁺ = u + τ(v + v⁺)/2. Each is solved by Newton's method with the
     contact inside, as a load step of ``NonlinearContactProblem``. Momentum is kept to the
     tolerance; the energy of a hyperelastic body in free flight is off by terms of τ², which do not
     add up. In finite strain contact acts where the bodies are, and a stabilised step starts with
-    the velocity (w − u)/τ that goes to the predictor w, by the rows of the places at its begin:
+    the velocity (w − u)/τ that goes to the predictor w, by the constraints where bodies begin it:
     contact takes from the nodes that hit their velocity along the normal. All is collective.
 
     Args:

@@ -201,7 +201,8 @@ class LoadSteps:
         begin: Where the first step begins.
         path: File for ParaView with all steps, ``.bp``, or ``.pvd`` as ``write_pvd``; None: none.
             It has its name when the series has ended, also by an error of this package, unless
-            that is its own, as on a full disk; before that it is ``.<name>.partial`` beside it.
+            that is its own, as on a full disk; before that it is
+            ``.<name>.partial`` in the same folder.
         interior: Whether the file has the fields of ``solution.interior``, too, as ``write_vtx``.
         checkpoint: Folder for the last converged step, with nothing else in it; None: none.
         max_halvings: How often a step may be halved.
@@ -296,7 +297,7 @@ class LoadSteps:
         """Write a table of the steps so far, a line a step, by rank 0. Collective.
 
         Columns: time, the force on each contact by name and axis, motion and forces of each rigid
-        body, what friction dissipates, multiplications by F, seconds.
+        body, what friction dissipates, iterations, seconds.
 
         Args:
             path: File, ending in ``.csv``; one that is there is replaced.
@@ -313,10 +314,11 @@ class LoadSteps:
             if self._comm.rank == 0:
                 forces = [f"{name} {axis}" for name in names for axis in axes]
                 tools = list(self.records[0].tools) if self.records else []
-                table: list[list[Any]] = [["time", *forces, *tools, "dissipation", "F", "seconds"]]
+                last = ["dissipation", "iterations", "seconds"]
+                table: list[list[Any]] = [["time", *forces, *tools, *last]]
                 for r in self.records:
                     values = [*chain(*r.contact_forces), *(r.tools[name] for name in tools)]
-                    count = r.figures["F_multiplications"]
+                    count = r.figures["iterations"]
                     table.append([r.time, *values, r.dissipation, count, r.seconds])
                 with (
                     written_whole(target) as partial,
@@ -354,9 +356,9 @@ class LoadSteps:
             if self._comm.rank == 0:
                 figures = self.records[-1].figures
                 log.info(
-                    "load step %d of %d, t = %.6g: %d multiplications by F, %.2g s",
+                    "load step %d of %d, t = %.6g: %d iterations, %.2g s",
                     *(place.number + 1, len(times) - 1, t),
-                    *(figures["F_multiplications"], self.records[-1].seconds),
+                    *(figures["iterations"], self.records[-1].seconds),
                 )
             place = place.ahead()
             self._keep(place, t)
@@ -464,7 +466,7 @@ class LoadSteps:
             if now is None or abs(now - before) > rounding:
                 raise InputError(
                     f"the checkpoint is of a series with the times {shown(reached)}, begin "
-                    f"first; expected those, got {shown(given)}, {now} in the place of {before}"
+                    f"first; expected those, got {shown(given)}, {now} instead of {before}"
                 )
 
     def _close(self) -> None:

@@ -115,7 +115,7 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
         )
     extents = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     return (
-        "the stiffness is indefinite by rounding: its softest deformations are lost beside its "
+        "the stiffness is indefinite by rounding: its softest deformations are lost next to its "
         f"stiffest (its length is {extents[0] / max(extents[-1], TINY):.0e} of its thickness, its "
         f"diagonal spans a factor of {diagonal.max() / diagonal.min():.0e}); expected subdomains "
         "and cells that are less flat, or moduli that differ less"

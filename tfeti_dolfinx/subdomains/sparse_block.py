@@ -142,8 +142,8 @@ class Traced:
             return regularised(K_ii.csr() if R.shape[1] else K_ii, R, fixing, how.prefix)
         except FactorError as error:
             raise FactorError(
-                f"{stiffness.name}: the stiffness of the unknowns that no row touches, for the "
-                f"dirichlet preconditioner: {error}"
+                f"{stiffness.name}: the stiffness of the unknowns that no constraint touches, for "
+                f"the dirichlet preconditioner: {error}"
             ) from error
 
 
