@@ -22,26 +22,21 @@ EVERYWHERE = 1e6
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene that can be meshed and set up at any size.
+    """A scene that can be meshed and set up at any size."""
 
-    Attributes:
-        build: From elements along a (around the shaft) and the kind of mesh to gmsh's model.
-        make: From a torn mesh and the degree to the arguments of ``ContactProblem``.
-        samples: Where pressures are compared.
-        exact: The closed form there.
-        place: From points of the contact, shape ``(n, 3)``, to places along it.
-        young: Young's modulus at points.
-        force: What is compared there, of the contact's data.
-        solve: Solves the problem, in load steps where it takes some.
-    """
-
+    # from elements along a (around the shaft) and the kind of mesh to gmsh's model
     build: Callable[[float, str], Any]
+    # from a torn mesh and the degree to the arguments of ``ContactProblem``
     make: Callable[[tfeti.Decomposition, int], dict[str, Any]]
-    samples: Samples
-    exact: Array
+    samples: Samples  # where pressures are compared
+    exact: Array  # the closed form there
+    # from points of the contact, shape ``(n, 3)``, to places along it
     place: Callable[[Array], Array] = lambda points: points[:, :1]
+    # Young's modulus at points
     young: Callable[[Array], Array] = lambda points: np.ones(len(points))
+    # what is compared there, of the contact's data
     force: Callable[[Any], Array] = lambda data: data.pressure
+    # solves the problem, in load steps where it takes some
     solve: Callable[[tfeti.ContactProblem], None] = lambda problem: problem.solve()
 
 

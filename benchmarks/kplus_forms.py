@@ -88,11 +88,7 @@ def trailing_pseudoinverse(K, R, fixing_dofs, prefix="tfeti_sub_", no_pivot=1e-4
     )
 
 
-FORMS = {
-    "regularized": regularised,
-    "schur": SchurPseudoinverse,
-    "lu_svd": trailing_pseudoinverse,
-}
+FORMS = {"regularized": regularised, "schur": SchurPseudoinverse, "lu_svd": trailing_pseudoinverse}
 
 
 class Beam:

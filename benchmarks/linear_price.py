@@ -69,21 +69,14 @@ LOWEST = 1e-4  # of rtol: where this is not low enough the table shows the error
 
 @dataclass
 class Linear:
-    """A K x = b, the held components taken out of it, and what is known of it.
+    """A K x = b, the held components taken out of it, and what is known of it."""
 
-    Attributes:
-        A: The stiffness, rows and columns of held components those of the identity.
-        b: The load that is left, 0 where it is held.
-        reference: The displacement, less that of the held components alone, shape ``(n,)``.
-        scale: The largest displacement.
-        seconds: Of assembly; that copies are joined again is the benchmark's, and not counted.
-    """
-
-    A: PETSc.Mat
-    b: PETSc.Vec
+    A: PETSc.Mat  # the stiffness, rows and columns of held components those of the identity
+    b: PETSc.Vec  # the load that is left, 0 where it is held
+    # the displacement, less that of the held components alone, shape ``(n,)``
     reference: np.ndarray
-    scale: float
-    seconds: float
+    scale: float  # the largest displacement
+    seconds: float  # of assembly; that copies are joined again is the benchmark's, and not counted
 
     def error(self, x):
         """Largest error of a solution, in terms of the largest displacement. Collective."""

@@ -21,17 +21,11 @@ FINE = 300  # samples along a
 
 @dataclass(frozen=True)
 class LineContact:
-    """Parallel cylinders (Hertz): a = √(4P'R/(πE*)), p₀ = 2P'/(πa).
+    """Parallel cylinders (Hertz): a = √(4P'R/(πE*)), p₀ = 2P'/(πa)."""
 
-    Attributes:
-        half_width: a.
-        load: P', a force per length.
-        peak: p₀.
-    """
-
-    half_width: float
-    load: float
-    peak: float
+    half_width: float  # a
+    load: float  # P', a force per length
+    peak: float  # p₀
 
     @classmethod
     def from_half_width(cls, a: float, radius: float, modulus: float) -> LineContact:
@@ -69,18 +63,12 @@ class RoundedPunch:
     """A flat of the half width s whose edges are rounded with the radius R, on a half plane.
 
     Ciavarella, Hills, Monno, Proc. Inst. Mech. Eng. C 212 (1998).
-
-    Attributes:
-        flat: s.
-        half_width: Half width b > s of the contact.
-        radius: R.
-        modulus: E*.
     """
 
-    flat: float
-    half_width: float
-    radius: float
-    modulus: float
+    flat: float  # s
+    half_width: float  # half width b > s of the contact
+    radius: float  # R
+    modulus: float  # E*
 
     @property
     def _angle(self) -> float:
@@ -121,17 +109,11 @@ def fit(comm: Any, r: Array, p: Array, peak: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Samples:
-    """Where pressures are compared.
+    """Where pressures are compared."""
 
-    Attributes:
-        points: Along the contact, shape ``(n, 1)`` or ``(n, 2)``.
-        weights: What each of them counts, an area.
-        half_width: a; None where contact is everywhere.
-    """
-
-    points: Array
-    weights: Array
-    half_width: float | None
+    points: Array  # along the contact, shape ``(n, 1)`` or ``(n, 2)``
+    weights: Array  # what each of them counts, an area
+    half_width: float | None  # a; None where contact is everywhere
 
     @classmethod
     def line(cls, a: float) -> Samples:

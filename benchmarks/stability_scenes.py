@@ -21,21 +21,13 @@ UNITS = [(1.0, 1.0)] + [(m, Pa) for m in (1e-9, 1e-3, 1e3) for Pa in (1e3, 1e9, 
 
 @dataclass(frozen=True)
 class Ladder:
-    """A scene with one thing that becomes harder, rung by rung.
+    """A scene with one thing that becomes harder, rung by rung."""
 
-    Attributes:
-        group: What it is about.
-        name: Name of the scene.
-        rung: From a cell type and a value to the scene.
-        values: The values, the friendly one first.
-        cells: Cell types that it makes sense for.
-    """
-
-    group: str
-    name: str
-    rung: Callable[[str, float], Scene]
-    values: Sequence[float]
-    cells: Sequence[str] = CELLS
+    group: str  # what it is about
+    name: str  # name of the scene
+    rung: Callable[[str, float], Scene]  # from a cell type and a value to the scene
+    values: Sequence[float]  # the values, the friendly one first
+    cells: Sequence[str] = CELLS  # cell types that it makes sense for
 
 
 def up(cell: str, vertical: float, across: float = 0.0) -> tuple[float, ...]:

@@ -17,13 +17,7 @@ from typing import ClassVar
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-from benchmarks.tools import (
-    STAGES,
-    choose_clock,
-    command_line,
-    configure_clock,
-    finish,
-)
+from benchmarks.tools import STAGES, choose_clock, command_line, configure_clock, finish
 from demos import petsc_options, scene
 
 DEMOS = ("cube_3d", "hertz_3d")

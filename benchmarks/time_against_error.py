@@ -73,29 +73,17 @@ COMM = MPI.COMM_WORLD
 
 @dataclass(frozen=True)
 class Case:
-    """What is solved.
+    """What is solved."""
 
-    Attributes:
-        scene: Its name.
-        sizes: Elements along a, or goals of the adaptive loop.
-        mesh: Uniform, graded or adaptive.
-        cell: Triangles, or quadrilaterals.
-        degree: Of displacements.
-        order: Of the cells' geometry.
-        ranks: Processes.
-        rtol: The solver's tolerance.
-        processor: Whether seconds are those of the processor, not of the wall.
-    """
-
-    scene: str
-    sizes: tuple[float, ...]
-    mesh: str = GRADED
-    cell: str = TRIANGLE
-    degree: int = 1
-    order: int = 1
-    ranks: int = 1
-    rtol: float | str = 1e-6
-    processor: bool = False
+    scene: str  # its name
+    sizes: tuple[float, ...]  # elements along a, or goals of the adaptive loop
+    mesh: str = GRADED  # uniform, graded or adaptive
+    cell: str = TRIANGLE  # triangles, or quadrilaterals
+    degree: int = 1  # of displacements
+    order: int = 1  # of the cells' geometry
+    ranks: int = 1  # processes
+    rtol: float | str = 1e-6  # the solver's tolerance
+    processor: bool = False  # whether seconds are those of the processor, not of the wall
 
     @property
     def label(self) -> str:

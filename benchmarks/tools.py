@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import re
 import resource
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -105,6 +107,45 @@ def say(row: Mapping[str, Any]) -> None:
     """Print a row on rank 0 at once: large scenes take their time."""
     if MPI.COMM_WORLD.rank == 0:
         print(*map(_text, row.values()), sep=" | ", flush=True)
+
+
+def over_seeds(
+    description: str, argv: Sequence[str], count: int, name: str, run: Callable[[int], dict]
+) -> list[dict[str, Any]]:
+    """Run random scenes and write ``name.json`` as rows come; the rows, complete on rank 0.
+
+    Collective. A row has a ``class``; what is not right is printed.
+    """
+    parser = argparse.ArgumentParser(description=description.split("\n")[0])
+    parser.add_argument("--scenes", type=int, default=count, help="how many random scenes")
+    parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument("--only", nargs="*", type=int, help="seeds of scenes")
+    parser.add_argument("--output", type=Path, default=Path("results"))
+    arguments = parser.parse_args(argv)
+    rows = list[dict[str, Any]]()
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    for seed in arguments.only or range(arguments.seed, arguments.seed + arguments.scenes):
+        rows.append({"scene": seed, **run(seed)})
+        if MPI.COMM_WORLD.rank == 0:
+            text = json.dumps(rows, indent=1, default=float)
+            (arguments.output / f"{name}.json").write_text(text + "\n")
+            if not rows[-1]["class"].startswith("right"):
+                keys = ("class", "kind", "law", "error", "reference", "reason")
+                said = " ".join(str(rows[-1].get(key, "")) for key in keys)
+                print(seed, " ".join(said.split())[:300], flush=True)
+    logging.disable(before)
+    if MPI.COMM_WORLD.rank == 0:
+        for kind, number in Counter(row["class"] for row in rows).most_common():
+            print(f"{number:6} {kind}")
+    return rows
+
+
+def wrong(rows: Sequence[Mapping[str, Any]]) -> int:
+    """1 on all ranks if a class is in capitals. Collective."""
+    found = any(row["class"].split(":")[0].isupper() for row in rows)
+    return int(MPI.COMM_WORLD.bcast(found))
 
 
 def write_documents(name: str, tables: Tables, commit: str, folder: Path = ROOT / "docs") -> None:

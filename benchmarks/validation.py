@@ -38,25 +38,16 @@ FINE = 0.4
 
 @dataclass
 class Row:
-    """A figure of a case.
+    """A figure of a case."""
 
-    Attributes:
-        case: Its name, with its source.
-        quantity: The figure.
-        reference: The published figure, or the closed form.
-        got: Ours.
-        allowed: Relative difference that the source allows, or None where it is for information.
-        problem: What has the report.
-        multiplications: By F and S in all; None: those of the last solve.
-    """
-
-    case: str
-    quantity: str
-    reference: float
-    got: float
+    case: str  # its name, with its source
+    quantity: str  # the figure
+    reference: float  # the published figure, or the closed form
+    got: float  # ours
+    # relative difference that the source allows, or None where it is for information
     allowed: float | None
-    problem: Any
-    multiplications: int | None = None
+    problem: Any  # what has the report
+    multiplications: int | None = None  # by F and S in all; None: those of the last solve
 
     @property
     def difference(self) -> float:

@@ -38,14 +38,14 @@ def test_wrong_nonlinear_steps_are_found(kind, serial_only):
     """A displacement that is a little off, and one without contact."""
     seeds = (nonlinear.random_scene(seed) for seed in range(100))
     scene = next(s for s in seeds if s.kind == kind and s.law == "neo-Hooke" and s.gdim == 2)
-    mesh, tags = nonlinear.blocks(scene)
-    run, none = nonlinear.posed(scene, mesh, tags), np.zeros(2)
+    made = nonlinear.blocks(scene)
+    run, none = nonlinear.posed(scene, *made), np.zeros(2)
     run.move(0.2 * scene.path[-1])
     run.problem.solve()
     u = run.problem.decomposition.to_original(run.problem.u)
-    assert nonlinear.Check(scene, mesh, tags).step(u, none, None) == []
+    assert nonlinear.Check(scene, *made).step(u, none, None) == []
     u.x.array[:] *= 1.0 + 1e-3 * np.arange(len(u.x.array)) / len(u.x.array)
-    assert nonlinear.Check(scene, mesh, tags).step(u, none, None)
+    assert nonlinear.Check(scene, *made).step(u, none, None)
 
 
 def answer(scene):

@@ -19,21 +19,13 @@ FacetsOf = Callable[[Side], tuple[np.ndarray, np.ndarray]]
 
 @dataclass
 class Conditions:
-    """All conditions of a scene.
+    """All conditions of a scene."""
 
-    Attributes:
-        N: Shape ``(c, n)``.
-        T: Along tangents, gdim − 1 rows of each condition, one after the other.
-        gap: Shape ``(c,)``.
-        given: Largest tangential forces, by Tresca's law.
-        coefficient: Of Coulomb's law.
-    """
-
-    N: csr_array
-    T: csr_array
-    gap: np.ndarray
-    given: np.ndarray
-    coefficient: np.ndarray
+    N: csr_array  # shape ``(c, n)``
+    T: csr_array  # along tangents, gdim − 1 rows of each condition, one after the other
+    gap: np.ndarray  # shape ``(c,)``
+    given: np.ndarray  # largest tangential forces, by Tresca's law
+    coefficient: np.ndarray  # of Coulomb's law
 
     @property
     def has_friction(self) -> bool:

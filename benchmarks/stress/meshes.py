@@ -17,32 +17,18 @@ from benchmarks.stress.scene import Scene
 # simplices around the diagonal of a box whose corners are numbered x + 2y + 4z
 SPLIT = {
     "triangle": [[0, 1, 3], [0, 2, 3]],
-    "tetrahedron": [
-        [0, 1, 3, 7],
-        [0, 1, 5, 7],
-        [0, 2, 3, 7],
-        [0, 2, 6, 7],
-        [0, 4, 5, 7],
-        [0, 4, 6, 7],
-    ],
+    "tetrahedron": [[0, a, b, 7] for a, b in ((1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6))],
 }
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells and points of all bodies.
+    """Cells and points of all bodies."""
 
-    Attributes:
-        points: Shape ``(n, gdim)``.
-        cells: Points of each cell.
-        body: Body of each cell.
-        colour: Colour of each cell on a checkerboard, 0 or 1.
-    """
-
-    points: np.ndarray
-    cells: np.ndarray
-    body: np.ndarray
-    colour: np.ndarray
+    points: np.ndarray  # (n, gdim)
+    cells: np.ndarray  # points of each cell
+    body: np.ndarray  # of each cell
+    colour: np.ndarray  # of each cell on a checkerboard, 0 or 1
 
 
 def grid(scene: Scene) -> Grid:
@@ -63,13 +49,10 @@ def grid(scene: Scene) -> Grid:
         points.append(x)
         start += len(x)
     g = Grid(*(np.concatenate(part) for part in (points, cells, body, colour)))
-    return _joined(g) if scene.joined else g
-
-
-def _joined(g: Grid) -> Grid:
-    """The same with one point where bodies have one in common."""
-    points, new = np.unique(g.points.round(12), axis=0, return_inverse=True)
-    return replace(g, points=points, cells=new.ravel()[g.cells])
+    if scene.joined:  # one point where bodies have one in common
+        once, new = np.unique(g.points.round(12), axis=0, return_inverse=True)
+        g = replace(g, points=once, cells=new.ravel()[g.cells])
+    return g
 
 
 def make_mesh(scene: Scene, g: Grid, comm: MPI.Intracomm) -> dmesh.Mesh:
@@ -165,13 +148,6 @@ def prescribed(scene: Scene, V: Any, facets_of: Any) -> list[fem.DirichletBC]:
     return made
 
 
-def bend(scene: Scene, mesh: dmesh.Mesh) -> None:
-    """Move the points of a mesh of boxes as a scene says; the first body is what is moved."""
-    if scene.bent is not None:
-        kind, strength = scene.bent
-        BENT[kind](scene, mesh, strength)
-
-
 def _layers(scene: Scene, mesh: dmesh.Mesh, strength: float) -> None:
     """Layers of cells that are as much flatter at the lowest side as ``strength`` says."""
     box, up = scene.bodies[0], scene.gdim - 1
@@ -203,4 +179,8 @@ def _arch(scene: Scene, mesh: dmesh.Mesh, strength: float) -> None:
     x[:, up] = strength - (strength - height) * np.cos(angle)
 
 
-BENT = {"layers": _layers, "slivers": _slivers, "arch": _arch}
+def bend(scene: Scene, mesh: dmesh.Mesh) -> None:
+    """Move the points of a mesh of boxes as a scene says; the first body is what is moved."""
+    if scene.bent is not None:
+        kind, strength = scene.bent
+        {"layers": _layers, "slivers": _slivers, "arch": _arch}[kind](scene, mesh, strength)

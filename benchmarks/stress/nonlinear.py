@@ -13,16 +13,11 @@ and Coulomb at each node. Classes in capitals must not occur; ends with 1 if one
 
 from __future__ import annotations
 
-import argparse
-import json
-import logging
 import signal
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import basix.ufl
@@ -33,7 +28,11 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.common.compat import geometry_dofmap, interpolation_points
+from benchmarks.stress import meshes
+from benchmarks.stress.scene import GDIM, Body, side_name
+from benchmarks.stress.scene import Scene as Boxes
+from benchmarks.tools import over_seeds, wrong
+from tfeti_dolfinx.common.compat import interpolation_points
 
 RTOL = 1e-7  # of the package
 RESIDUAL, GAP, SLIP = 1e-5, 1e-5, 1e-4  # of stiffness times displacement, and of displacement
@@ -48,34 +47,22 @@ MEETS = {
     "force": ("top",),
     "pair": ("inner low", "inner high"),
 }
-SIDES = {"bottom": 1, "top": 2, "inner low": 3, "inner high": 4}
 
 
 @dataclass
 class Scene:
-    """A scene drawn from a seed.
+    """A scene drawn from a seed."""
 
-    Attributes:
-        kind: "press", "tool", "force" or "pair".
-        law: "neo-Hooke", "St. Venant", "J2" or "deformation".
-        cell: Name of the cell type.
-        cells: Cells along the axes of each block.
-        nu: Poisson's ratio.
-        friction: μ.
-        radius: That of a ball, or infinite of a plane.
-        path: Displacements of what moves, or in the last component its force, shape ``(s, gdim)``.
-        subdomains: How many.
-    """
-
-    kind: str
-    law: str
-    cell: str
-    cells: list[tuple[int, ...]]
-    nu: float
-    friction: float
-    radius: float
+    kind: str  # "press", "tool", "force" or "pair"
+    law: str  # "neo-Hooke", "St. Venant", "J2" or "deformation"
+    cell: str  # name of the cell type
+    cells: list[tuple[int, ...]]  # cells along the axes of each block
+    nu: float  # Poisson's ratio
+    friction: float  # μ
+    radius: float  # that of a ball, or infinite of a plane
+    # displacements of what moves, or in the last component its force, shape ``(s, gdim)``
     path: np.ndarray
-    subdomains: int
+    subdomains: int  # how many
 
     @property
     def gdim(self) -> int:
@@ -94,7 +81,7 @@ def random_scene(seed: int) -> Scene:
     kind = str(rng.choice(list(HELD)))
     law = str(rng.choice(list(DEEPEST), p=[0.4, 0.1, 0.3, 0.2]))
     cell = str(rng.choice(CELLS, p=[0.35, 0.35, 0.15, 0.15]))
-    gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+    gdim = GDIM[cell]
     most = 7 if gdim == 2 else 4
     count = 2 if kind == "pair" else 1
     cells = [tuple(int(n) for n in rng.integers(2, most, gdim)) for _ in range(count)]
@@ -125,34 +112,21 @@ def random_scene(seed: int) -> Scene:
 # --- Meshes -----------------------------------------------------------------------------------
 
 
-def blocks(scene: Scene) -> tuple[dmesh.Mesh, Any]:
-    """Unit blocks, one on the other, that share no node, and tags of ``SIDES``."""
-    kind, gdim = dmesh.to_type(scene.cell), scene.gdim
-    cells, points, start = [], [], 0
-    for i, n in enumerate(scene.cells):
-        low, high = np.zeros(gdim), np.ones(gdim)
-        low[-1], high[-1] = i, i + 1
-        make = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
-        box = make(MPI.COMM_SELF, [low, high], list(n), kind)
-        cells.append(start + geometry_dofmap(box))
-        points.append(box.geometry.x[:, :gdim])
-        start += len(box.geometry.x)
-        element = box.ufl_domain().ufl_coordinate_element()
-    whole = np.concatenate(cells).astype(np.int64)
-    mesh = dmesh.create_mesh(MPI.COMM_SELF, cells=whole, x=np.concatenate(points), e=element)
-    mesh.topology.create_connectivity(gdim - 1, gdim)
-    outer = dmesh.exterior_facet_indices(mesh.topology)
-    links = mesh.topology.connectivity(gdim - 1, gdim)
-    cell = np.array([links.links(f)[0] for f in outer], dtype=np.int32)
-    height = dmesh.compute_midpoints(mesh, gdim - 1, outer)[:, gdim - 1]
-    above = dmesh.compute_midpoints(mesh, gdim, cell)[:, gdim - 1] > 1.0
-    values = np.zeros(len(outer), dtype=np.int32)
-    values[np.isclose(height, 0.0)] = SIDES["bottom"]
-    values[np.isclose(height, len(scene.cells))] = SIDES["top"]
-    if len(scene.cells) == 2:
-        inner = np.isclose(height, 1.0)
-        values[inner & ~above], values[inner & above] = SIDES["inner low"], SIDES["inner high"]
-    return mesh, dmesh.meshtags(mesh, gdim - 1, outer[values > 0], values[values > 0])
+def blocks(scene: Scene) -> tuple[dmesh.Mesh, Any, dict[str, int]]:
+    """Unit blocks, one on the other, that share no node; tags of their sides, and names of some."""
+    up = (0.0,) * (scene.gdim - 1)
+    bodies = [
+        Body((*up, float(k)), (*(1.0 for _ in up), k + 1.0), n) for k, n in enumerate(scene.cells)
+    ]
+    boxes = Boxes(scene.cell, tuple(bodies))
+    g = meshes.grid(boxes)
+    mesh = meshes.make_mesh(boxes, g, MPI.COMM_SELF)
+    tags = meshes.tag_sides(boxes, mesh, g.body[np.asarray(mesh.topology.original_cell_index)])
+    last, axis = len(bodies) - 1, len(up)
+    names = {"bottom": (0, axis, 0), "top": (last, axis, 1)}
+    if last:
+        names |= {"inner low": (0, axis, 1), "inner high": (1, axis, 0)}
+    return mesh, tags, {name: boxes.surfaces[side_name(side)] for name, side in names.items()}
 
 
 # --- Laws -------------------------------------------------------------------------------------
@@ -264,24 +238,27 @@ class Run:
     move: Callable[[np.ndarray], None]
 
 
+def placed(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """A point of the obstacle and its normal there: below what is pressed on it, or a tool above.
+
+    The bottom of the ball or the plane of a tool is at the top of the block.
+    """
+    foot, normal = np.full(scene.gdim, 0.45), np.zeros(scene.gdim)
+    foot[-1], normal[-1] = (0.0, 1.0) if scene.kind == "press" else (1.0, -1.0)
+    return foot, normal
+
+
 def shape_of(scene: Scene) -> Any:
-    """The obstacle: below a block that is pressed on it, above one that a tool presses."""
-    gdim = scene.gdim
-    side = -1.0 if scene.kind == "press" else 1.0
-    point = np.full(gdim, 0.45)
-    point[-1] = 0.0 if scene.kind == "press" else 1.0
+    """The obstacle in the package's words."""
+    foot, normal = placed(scene)
     if np.isinf(scene.radius):
-        normal = np.zeros(gdim)
-        normal[-1] = -side
-        return tfeti.Plane(point, normal)
-    point[-1] += side * scene.radius
-    return tfeti.Sphere(point, scene.radius)
+        return tfeti.Plane(foot, normal)
+    return tfeti.Sphere(foot - scene.radius * normal, scene.radius)
 
 
-def posed(scene: Scene, mesh: dmesh.Mesh, tags: Any) -> Run:
+def posed(scene: Scene, mesh: dmesh.Mesh, tags: Any, surfaces: dict[str, int]) -> Run:
     """Give a scene to the package."""
     gdim = scene.gdim
-    surfaces = {name: tag for name, tag in SIDES.items() if tag in tags.values}
     decomposition = tfeti.decompose(mesh, scene.subdomains, facet_tags=tags, surfaces=surfaces)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
     u = fem.Function(V, name="u")
@@ -332,9 +309,10 @@ class Check:
         scene: The scene.
         mesh: The mesh given to ``decompose``.
         tags: Tags of its sides.
+        surfaces: Their names.
     """
 
-    def __init__(self, scene: Scene, mesh: dmesh.Mesh, tags: Any) -> None:
+    def __init__(self, scene: Scene, mesh: dmesh.Mesh, tags: Any, surfaces: dict[str, int]) -> None:
         self.scene, gdim = scene, scene.gdim
         V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
         self.u, self.x = fem.Function(V), V.tabulate_dof_coordinates()[:, :gdim]
@@ -344,7 +322,7 @@ class Check:
         self._form = fem.form(self.law.residual)
         nodes = {
             name: fem.locate_dofs_topological(V, gdim - 1, tags.find(tag))
-            for name, tag in SIDES.items()
+            for name, tag in surfaces.items()
         }
         self.held = np.unique(np.concatenate([nodes[name] for name in HELD[scene.kind]]))
         self.meets = [nodes[name] for name in MEETS[scene.kind]]
@@ -420,14 +398,10 @@ class Check:
 
     def _distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance from the obstacle where its motion is 0, and its normal."""
-        up = np.zeros(self._gdim)
-        side = 1.0 if self.scene.kind == "press" else -1.0
-        up[-1] = side
-        foot = np.full(self._gdim, 0.45)
-        foot[-1] = 0.0 if self.scene.kind == "press" else 1.0
+        foot, normal = placed(self.scene)
         if np.isinf(self.scene.radius):
-            return (x - foot) @ up, np.tile(up, (len(x), 1))
-        way = x - (foot - self.scene.radius * up)
+            return (x - foot) @ normal, np.tile(normal, (len(x), 1))
+        way = x - (foot - self.scene.radius * normal)
         r = np.linalg.norm(way, axis=1)
         return r - self.scene.radius, way / r[:, None]
 
@@ -459,9 +433,9 @@ def run_scene(scene: Scene) -> dict[str, Any]:
 
 
 def _solved(scene: Scene, row: dict[str, Any]) -> str:
-    mesh, tags = blocks(scene)
-    run, check = posed(scene, mesh, tags), Check(scene, mesh, tags)
-    problem, wrong = run.problem, list[str]()
+    made = blocks(scene)
+    run, check = posed(scene, *made), Check(scene, *made)
+    problem, missed = run.problem, list[str]()
     row["F"] = row["newton"] = 0
 
     def advance(start: np.ndarray, end: np.ndarray, halvings: int) -> None:
@@ -485,7 +459,7 @@ def _solved(scene: Scene, row: dict[str, Any]) -> str:
             tool = np.array(problem.solution.tool("tool").displacement)
             force = float(end[-1]) if scene.kind == "force" else None
         u = problem.decomposition.to_original(problem.u)
-        wrong.extend(check.step(u, tool, force))
+        missed.extend(check.step(u, tool, force))
 
     start = np.zeros(scene.gdim)
     if scene.kind == "force":
@@ -495,36 +469,15 @@ def _solved(scene: Scene, row: dict[str, Any]) -> str:
         start = end
     problem.destroy()
     row["worst"] = check.worst
-    if wrong:
-        row["error"] = "; ".join(wrong[:4])
-    return "WRONG" if wrong else "right"
+    if missed:
+        row["error"] = "; ".join(missed[:4])
+    return "WRONG" if missed else "right"
 
 
 def main(argv: list[str]) -> list[dict[str, Any]]:
     """Run scenes; returns their rows."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--scenes", type=int, default=300, help="how many random scenes")
-    parser.add_argument("--seed", type=int, default=0, help="the first seed")
-    parser.add_argument("--only", nargs="*", type=int, help="seeds of scenes")
-    parser.add_argument("--output", type=Path, default=Path("results"))
-    arguments = parser.parse_args(argv)
-    rows = list[dict[str, Any]]()
-    logging.disable(logging.WARNING)
-    arguments.output.mkdir(parents=True, exist_ok=True)
-    for seed in arguments.only or range(arguments.seed, arguments.seed + arguments.scenes):
-        scene = random_scene(seed)
-        rows.append({"scene": seed, **run_scene(scene)})
-        text = json.dumps(rows, indent=1, default=float)
-        (arguments.output / "nonlinear.json").write_text(text + "\n")
-        if rows[-1]["class"] != "right":
-            keys = ("class", "kind", "law", "error")
-            print(seed, " ".join(str(rows[-1].get(key, "")) for key in keys)[:300], flush=True)
-    logging.disable(logging.NOTSET)
-    for name, count in Counter(row["class"] for row in rows).most_common():
-        print(f"{count:6} {name}")
-    return rows
+    return over_seeds(__doc__, argv, 300, "nonlinear", lambda seed: run_scene(random_scene(seed)))
 
 
 if __name__ == "__main__":
-    wrong = any(row["class"].isupper() for row in main(sys.argv[1:]))
-    sys.exit(int(wrong))
+    sys.exit(wrong(main(sys.argv[1:])))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,30 +16,17 @@ from benchmarks.stress.scene import Scene, Wall, side_name, wall_distance
 
 @dataclass
 class Outcome:
-    """What the package did with a scene, on rank 0.
+    """What the package did with a scene, on rank 0; what is not known is None."""
 
-    Attributes:
-        error: Type and message of what was raised, the same on all ranks, or "".
-        disagree: What ranks raised where they differ, else "".
-        mu: Lamé's μ of the grid's cells, if the mesh could be torn.
-        lmbda: Lamé's λ of them.
-        x: Nodes of all torn copies.
-        body: Their bodies.
-        u: Their displacements.
-        forces: Resultants of the contact forces on the bodies.
-        report: Some of the report.
-        seconds: Wall time.
-    """
-
-    error: str = ""
-    disagree: str = ""
-    mu: np.ndarray | None = None
+    error: str = ""  # type and message of what was raised, the same on all ranks
+    disagree: str = ""  # what ranks raised where they differ
+    mu: np.ndarray | None = None  # Lamé's constants of the grid's cells, if the mesh was torn
     lmbda: np.ndarray | None = None
-    x: np.ndarray | None = None
+    x: np.ndarray | None = None  # nodes of all torn copies, their bodies and displacements
     body: np.ndarray | None = None
     u: np.ndarray | None = None
-    forces: np.ndarray | None = None
-    report: dict[str, Any] = field(default_factory=dict)
+    forces: np.ndarray | None = None  # resultants of the contact forces on the bodies
+    report: dict[str, Any] = field(default_factory=dict)  # some of it
     seconds: float = 0.0
 
 
@@ -59,61 +45,47 @@ class WallShape:
         return wall_distance(self.wall, x)[1]
 
 
-def pair(secondary: str, primary: str, friction: Any) -> tfeti.Contact:
-    """A pair whose first surface carries the multipliers, in the package's words."""
-    return tfeti.Contact(secondary, primary, secondary=secondary, friction=friction)
-
-
 def contacts_of(scene: Scene) -> list[Any]:
+    """Obstacles and pairs in the package's words."""
+    laws = {"tresca": tfeti.Tresca, "coulomb": tfeti.Coulomb}
+
+    def law(friction: tuple[str, float] | None) -> Any:
+        return friction and laws[friction[0]](friction[1])
+
     walls = [
         tfeti.Obstacle(side_name(w.side), WallShape(w), friction=law(w.friction))
         for w in scene.walls
     ]
-    pairs = [
-        pair(side_name(p.secondary), side_name(p.primary), law(p.friction)) for p in scene.pairs
-    ]
-    return walls + pairs
-
-
-def law(friction: tuple[str, float] | None) -> tfeti.Tresca | tfeti.Coulomb | None:
-    """A law of friction in the package's words."""
-    if friction is None:
-        return None
-    kind, number = friction
-    return tfeti.Tresca(number) if kind == "tresca" else tfeti.Coulomb(number)
+    for p in scene.pairs:
+        own, other = side_name(p.secondary), side_name(p.primary)
+        walls.append(tfeti.Contact(own, other, secondary=own, friction=law(p.friction)))
+    return walls
 
 
 def partition(scene: Scene) -> Any:
-    """What ``decompose`` is given: a number, or a random one by nearest points of each body."""
-    if scene.hanging:
-        return partial(_hanging, scene)
-    if scene.scattered is None:
+    """What ``decompose`` is given: a number, or subdomains of points.
+
+    Random ones are by nearest points of each body. Those that hang together in corners alone are
+    two in each body, its quarters or eighths in turn.
+    """
+    if not scene.hanging and scene.scattered is None:
         return scene.subdomains
-    rng = np.random.default_rng(scene.scattered)
     low = np.array([b.low for b in scene.bodies])
     high = np.array([b.high for b in scene.bodies])
-    share = -(-scene.subdomains // len(scene.bodies))
+    share = 2 if scene.hanging else -(-scene.subdomains // len(scene.bodies))
+    rng = np.random.default_rng(scene.scattered or 0)
     seeds = rng.uniform(size=(len(scene.bodies), share, scene.gdim))
 
     def subdomain(x: np.ndarray) -> np.ndarray:
-        x = x[: scene.gdim].T
-        t = (x[:, None] - low) / (high - low)
+        t = (x[: scene.gdim].T[:, None] - low) / (high - low)
         body = np.abs(t - 0.5).max(axis=2).argmin(axis=1)
-        own = t[np.arange(len(x)), body]
+        own = t[np.arange(len(t)), body]
+        if scene.hanging:
+            return share * body + (own > 0.5).sum(axis=1) % 2
         nearest = np.linalg.norm(own[:, None] - seeds[body], axis=2)
-        return body * share + nearest.argmin(axis=1)
+        return share * body + nearest.argmin(axis=1)
 
     return subdomain
-
-
-def _hanging(scene: Scene, x: np.ndarray) -> np.ndarray:
-    """Two subdomains in each body, its quarters or eighths in turn: they meet in corners alone."""
-    low = np.array([b.low for b in scene.bodies])
-    high = np.array([b.high for b in scene.bodies])
-    t = (x[: scene.gdim].T[:, None] - low) / (high - low)
-    body = np.abs(t - 0.5).max(axis=2).argmin(axis=1)
-    part = (t[np.arange(len(t)), body] > 0.5).sum(axis=1) % 2
-    return 2 * body + part
 
 
 def solve_scene(scene: Scene, g: meshes.Grid, comm: MPI.Intracomm) -> Outcome:

@@ -202,13 +202,9 @@ def random_scene(seed: int) -> Scene:
     draw = Draw(np.random.default_rng([seed, 2006]))
     kind = draw.one("single", "stack", "row", "bridge", "apart")
     draw.note = kind
-    {
-        "single": _single,
-        "stack": _stack,
-        "row": _row,
-        "bridge": _bridge,
-        "apart": _apart,
-    }[kind](draw)
+    {"single": _single, "stack": _stack, "row": _row, "bridge": _bridge, "apart": _apart}[kind](
+        draw
+    )
     return draw.scene()
 
 

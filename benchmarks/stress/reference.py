@@ -20,14 +20,7 @@ from benchmarks.stress import meshes
 from benchmarks.stress.conditions import conditions
 from benchmarks.stress.scene import Scene, Side
 from benchmarks.stress.sliding import Law, solve_sliding
-from benchmarks.stress.solve import (
-    DEPENDENT,
-    EPSILON,
-    UnsettledError,
-    null_space,
-    solve,
-    verdict,
-)
+from benchmarks.stress.solve import DEPENDENT, EPSILON, UnsettledError, null_space, solve, verdict
 from tfeti_dolfinx.common.compat import geometry_dofmap
 
 SMALLEST = 1e-9  # of the largest displacement of all bodies: what a body has at least
@@ -39,34 +32,22 @@ CARRIES = 1e-7  # of the largest force
 
 @dataclass
 class Answer:
-    """What is right.
+    """What is right."""
 
-    Attributes:
-        verdict: solvable, no_solution, contradiction (of prescribed values and contacts), or
-            borderline.
-        x: Nodes, shape ``(n, 3)``.
-        body: Body of each node.
-        u: Displacement, shape ``(n, gdim)``.
-        forces: Contact forces on the nodes, shape ``(n, gdim)``.
-        free: Rigid motions that the solution is unique up to, shape ``(n * gdim, k)``.
-        load: Sum of the absolute values of the load.
-        noise: Relative change of u, per body, when K and the gaps change by rounding.
-        force_noise: Change of the resultants of the contact forces on the bodies by that.
-        rows: Conditions N u ≤ gap.
-        gap: Their right sides.
-    """
-
+    # solvable, no_solution, contradiction (of prescribed values and contacts), or borderline
     verdict: str
-    x: np.ndarray
-    body: np.ndarray
-    rows: csr_array
-    gap: np.ndarray
-    load: float
-    u: np.ndarray | None = None
-    forces: np.ndarray | None = None
+    x: np.ndarray  # nodes, shape ``(n, 3)``
+    body: np.ndarray  # body of each node
+    rows: csr_array  # conditions N u ≤ gap
+    gap: np.ndarray  # their right sides
+    load: float  # sum of the absolute values of the load
+    u: np.ndarray | None = None  # displacement, shape ``(n, gdim)``
+    forces: np.ndarray | None = None  # contact forces on the nodes, shape ``(n, gdim)``
+    # rigid motions that the solution is unique up to, shape ``(n * gdim, k)``
     free: np.ndarray | None = None
+    # relative change of u, per body, when K and the gaps change by rounding
     noise: np.ndarray | None = None
-    force_noise: float = 0.0
+    force_noise: float = 0.0  # change of the resultants of the contact forces on the bodies by that
 
     @property
     def point_noise(self) -> np.ndarray:
@@ -224,7 +205,7 @@ class Untorn:
         K = self.K[free][:, free]
         e = R.T @ self.f[free]
         e[np.abs(e) <= NO_WORK * known.load] = 0.0
-        lam, u = solve(K, f, N, gap, R, e)
+        lam, u, rigid = solve(K, f, N, gap, R, e)
         carrying = lam > CARRIES * lam.max(initial=0.0)
         kept = R @ null_space(N[carrying] @ R)
         known.free = np.zeros((len(self.f), kept.shape[1]))
@@ -232,7 +213,7 @@ class Untorn:
         known.u = self._smallest(u, known.free)
         known.forces = self._forces(used, lam)
         K, gap = self._shaken(known, K, self.rows[used], gap)
-        pressed, other = solve(K, f, N, gap, R, e, lam > 0.0)
+        pressed, other, _ = solve(K, f, N, gap, R, e, (lam > 0.0, rigid))
         second = self._smallest(other, known.free)
         known.noise = body_errors(known, second)
         change = resultants(known, self._forces(used, pressed)) - resultants(known, known.forces)

@@ -14,23 +14,14 @@ GDIM = {"triangle": 2, "quadrilateral": 2, "tetrahedron": 3, "hexahedron": 3}
 
 @dataclass(frozen=True)
 class Body:
-    """A box of cells, with Young's modulus E on one colour of a checkerboard, E·jump on the other.
-
-    Attributes:
-        low: Lowest corner.
-        high: Highest corner.
-        cells: Cells along the axes.
-        E: Young's modulus.
-        nu: Poisson's ratio.
-        jump: Ratio of moduli between the colours.
-    """
+    """A box of cells, with Young's modulus E on one colour of a checkerboard, E·jump on others."""
 
     low: Vector
     high: Vector
     cells: tuple[int, ...]
-    E: float = 1.0
-    nu: float = 0.3
-    jump: float = 1.0
+    E: float = 1.0  # Young's modulus
+    nu: float = 0.3  # Poisson's ratio
+    jump: float = 1.0  # ratio of moduli between the colours
 
 
 @dataclass(frozen=True)
@@ -52,19 +43,14 @@ class Load:
 
 @dataclass(frozen=True)
 class Wall:
-    """A rigid obstacle of a side.
-
-    Attributes:
-        side: The side.
-        kind: plane (point, normal); ball or bowl (centre, radius); bump, the graph of a
-            paraboloid (point, normal, curvature).
-        data: What the kind needs.
-        friction: A law, tresca or coulomb, and its number; None where it slides freely.
-    """
+    """A rigid obstacle of a side."""
 
     side: Side
+    # plane (point, normal); ball or bowl (centre, radius); bump, the graph of a paraboloid
+    # (point, normal, curvature)
     kind: str
-    data: tuple[Vector, ...]
+    data: tuple[Vector, ...]  # what the kind needs
+    # A law, tresca or coulomb, and its number; None where it slides freely
     friction: tuple[str, float] | None = None
 
 
@@ -79,41 +65,24 @@ class Pair:
 
 @dataclass(frozen=True)
 class Scene:
-    """Boxes, what holds them, what drives them, what they meet.
-
-    Attributes:
-        cell: Name of the cell type.
-        bodies: The boxes.
-        held: Dirichlet conditions.
-        loads: Loads.
-        walls: Obstacles.
-        pairs: Pairs of sides.
-        subdomains: Their number, by coordinate bisection.
-        scattered: Seed of a random partition into as many; None for the bisection.
-        hanging: Whether subdomains hang together at corners and edges alone.
-        subdomain_jump: Ratio of moduli between odd and even subdomains.
-        order: Degree of the displacements, 1 or 2; 2 for walls of one plane each only.
-        joined: Whether bodies share the points that they have in common: hinges.
-        bent: What becomes of the boxes' points, a name of ``meshes.BENT``, and a number.
-        options: Options of the package.
-        note: What the scene is about.
-    """
+    """Boxes, what holds them, what drives them, what they meet."""
 
     cell: str
     bodies: tuple[Body, ...]
-    held: tuple[Held, ...] = ()
+    held: tuple[Held, ...] = ()  # Dirichlet conditions
     loads: tuple[Load, ...] = ()
     walls: tuple[Wall, ...] = ()
     pairs: tuple[Pair, ...] = ()
-    subdomains: int = 4
-    scattered: int | None = None
-    hanging: bool = False
-    subdomain_jump: float = 1.0
-    order: int = 1
-    joined: bool = False
+    subdomains: int = 4  # their number, by coordinate bisection
+    scattered: int | None = None  # seed of a random partition into as many; None for the bisection
+    hanging: bool = False  # whether subdomains hang together at corners and edges alone
+    subdomain_jump: float = 1.0  # ratio of moduli between odd and even subdomains
+    order: int = 1  # degree of the displacements, 1 or 2; 2 for walls of one plane each only
+    joined: bool = False  # whether bodies share the points that they have in common: hinges
+    # what becomes of the boxes' points, layers, slivers or arch, and a number
     bent: tuple[str, float] | None = None
     options: dict[str, float] = field(default_factory=lambda: {"tfeti_rtol": 1e-6})
-    note: str = ""
+    note: str = ""  # what the scene is about
 
     @property
     def gdim(self) -> int:

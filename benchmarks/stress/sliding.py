@@ -21,23 +21,14 @@ MOST = 100
 
 @dataclass
 class Law:
-    """Conditions on the free unknowns: arrays of doubles or of decimal digits, or sparse ones.
+    """Conditions on the free unknowns: arrays of doubles or of decimal digits, or sparse ones."""
 
-    Attributes:
-        N: Conditions N u ≤ gap, shape ``(c, n)``.
-        T: Slips T u + slip, shape ``(c (gdim - 1), n)``.
-        gap: Shape ``(c,)``.
-        slip: What prescribed values slip by, shape ``(c (gdim - 1),)``.
-        given: Bounds of Tresca's law.
-        coefficient: Of Coulomb's law.
-    """
-
-    N: Any
-    T: Any
-    gap: np.ndarray
-    slip: np.ndarray
-    given: np.ndarray
-    coefficient: np.ndarray
+    N: Any  # conditions N u ≤ gap, shape ``(c, n)``
+    T: Any  # slips T u + slip, shape ``(c (gdim - 1), n)``
+    gap: np.ndarray  # shape ``(c,)``
+    slip: np.ndarray  # what prescribed values slip by, shape ``(c (gdim - 1),)``
+    given: np.ndarray  # bounds of Tresca's law
+    coefficient: np.ndarray  # of Coulomb's law
 
 
 def solve_sliding(

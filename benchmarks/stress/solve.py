@@ -20,7 +20,6 @@ EPSILON = 2.2e-16
 STEPS = 20  # of conjugate gradients on the forces
 HELD = 1e-14  # of a row's terms: what it is missed by
 UNFELT = 1e-11
-NO_SIGN = 1e-9  # of the largest: values below have no sign
 
 
 class UnsettledError(Exception):
@@ -36,12 +35,7 @@ def null_space(A: np.ndarray) -> np.ndarray:
 
 
 def verdict(
-    N: csr_array,
-    gap: np.ndarray,
-    R: np.ndarray,
-    f: np.ndarray,
-    weight: np.ndarray,
-    length: float,
+    N: csr_array, gap: np.ndarray, R: np.ndarray, f: np.ndarray, weight: np.ndarray, length: float
 ) -> str:
     """Whether a displacement keeps all conditions, and no motion escapes to infinity."""
     size = max(np.abs(gap).max(initial=0.0), length)
@@ -76,51 +70,95 @@ def solve(
     gap: np.ndarray,
     R: np.ndarray,
     e: np.ndarray,
-    active: np.ndarray | None = None,
+    near: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """λ, u, and the rigid part of it, of min ½uᵀKu − fᵀu, N u ≤ gap; R spans ker K, e = Rᵀf.
+
+    Rows that carry force and a rigid part that are nearly right may be given.
+    """
+    if near is None:
+        near = guess(K, f, N, gap, R, e)
+    active, rigid = near
+    lam, bent = refine(K, f, N, gap - N @ rigid, R, active)
+    return lam, bent + rigid, rigid
+
+
+def guess(
+    K: csr_array, f: np.ndarray, N: csr_array, gap: np.ndarray, R: np.ndarray, e: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """λ and u of min ½uᵀKu − fᵀu, N u ≤ gap; R spans the kernel of K, e = Rᵀf."""
+    """Rows that carry force, and the rigid part of u, by the dual problem.
+
+    min ½λᵀFλ − dᵀλ, Gλ = e, λ ≥ 0, with the compliance F = N K⁺ Nᵀ; s = Fλ − d − Gᵀα. Rows whose
+    gaps are far come in when they are overlapped: they would spoil its scale.
+    """
     Q = np.linalg.qr(R)[0] if R.shape[1] else R
+    inverse = pinned_inverse(K, R)
+
+    def compliance(b: np.ndarray) -> np.ndarray:
+        b = b - Q @ (Q.T @ b)
+        x = inverse(b)
+        x += inverse(b - K @ x)
+        return x - Q @ (Q.T @ x)
+
+    if N.shape[0] == 0:
+        return np.zeros(0, dtype=bool), np.zeros(len(f))
+    F = N @ compliance(np.asarray(N.T.todense()))
+    F, d, G = 0.5 * (F + F.T), N @ compliance(f) - gap, np.asarray((N @ R).T)
+    for share in (0.25, 0.5, 0.75, 1.0):
+        reach = np.quantile(np.abs(gap), share)
+        near = np.abs(gap) <= (FARTHER * reach if share < 1.0 else np.inf)
+        for _ in range(20):
+            found = interior_point(F[np.ix_(near, near)], d[near], G[:, near], e)
+            if found is None:
+                break
+            lam, active = np.zeros(len(gap)), np.zeros(len(gap), dtype=bool)
+            lam[near], active[near], alpha = found
+            entered = ~near & (F @ lam - d - G.T @ alpha < 0.0)
+            if not entered.any():
+                return active, R @ alpha
+            near = near | entered
+    raise UnsettledError("Gλ = e has no solution, or far rows came in again and again")
+
+
+def pinned_inverse(K: csr_array, R: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """K⁻¹ where as many unknowns as R has columns, which span the kernel of K, are held."""
     pinned = qr(R.T, pivoting=True, mode="r")[1][: R.shape[1]]
-    rest = np.setdiff1d(np.arange(len(f)), pinned)
+    rest = np.setdiff1d(np.arange(K.shape[0]), pinned)
     scale = 1.0 / np.sqrt(K.diagonal()[rest])
     scaled = csr_array(K[rest][:, rest].multiply(scale[:, None]).multiply(scale))
     factor = splu(scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
-    def compliance(b: np.ndarray) -> np.ndarray:
-        b = b - Q @ (Q.T @ b)
-        right = b[rest] * scale[(...,) + (None,) * (b.ndim - 1)]
-        x = factor.solve(right)
-        x += factor.solve(right - scaled @ x)
-        out = np.zeros_like(b)
-        out[rest] = x * scale[(...,) + (None,) * (b.ndim - 1)]
-        return out - Q @ (Q.T @ out)
+    def inverse(b: np.ndarray) -> np.ndarray:
+        x = np.zeros_like(b)
+        x[rest] = (scale * factor.solve((scale * b[rest].T).T).T).T
+        return x
 
-    free = compliance(f)
-    if N.shape[0] == 0:
-        return np.zeros(0), free
-    W = compliance(np.asarray(N.T.todense()))
-    F, G = N @ W, np.asarray((N @ R).T)
-    F = 0.5 * (F + F.T)
-    lam, alpha = solve_near(F, N @ free - gap, G, e, gap, active)
-    rigid = R @ alpha
-    lam, bent = refine(K, f, N, gap - N @ rigid, R, lam)
-    return lam, bent + rigid
+    return inverse
 
 
 def refine(
-    K: csr_array, f: np.ndarray, N: csr_array, gap: np.ndarray, R: np.ndarray, lam: np.ndarray
+    K: csr_array, f: np.ndarray, N: csr_array, gap: np.ndarray, R: np.ndarray, active: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A primal active set from a λ that is nearly right.
+    """λ and u by a primal active set from one that is nearly right.
 
     The compliance of what bends easily drowns what contact holds: there the dual loses digits
     that the primal problem has.
     """
-    active, seen = lam > 0.0, set()
-    for _ in range(40):
+    seen = set()
+    for _ in range(200):
         u, lam = touching(K, f, N, gap, R, active)
         s = gap - N @ u
+        loose = R @ null_space(N[active] @ R)
+        away = loose @ (loose.T @ (f - K @ u - N.T @ lam))
+        speed = np.where(active, 0.0, N @ away)
+        meets = speed > DEPENDENT * np.abs(away).max(initial=0.0)
+        if meets.any() and np.abs(away).max() > WRONG * np.abs(f).max():
+            # a load moves bodies until they meet something
+            first = np.argmin(np.where(meets, s / np.where(meets, speed, 1.0), np.inf))
+            active = active | (np.arange(len(gap)) == first)
+            continue
         noise = ROUNDING * np.abs(lam).max(initial=0.0)
-        depth = ROUNDING * max(np.abs(u).max(), 1e-6 * np.abs(gap).max())
+        depth = ROUNDING * max(np.abs(u).max(), 1e-6 * np.abs(gap).max(initial=0.0))
         wrong = (active & (lam < -noise)) | (~active & (s < -depth))
         if not wrong.any():
             break
@@ -148,18 +186,7 @@ def touching(
     row = 1.0 / np.asarray((A.multiply(A) / K.diagonal()).sum(axis=1)).ravel()
     penalty = PENALTY * row
     M = csr_array(K + A.T @ (diags_array(penalty) @ A)) if len(row) else K
-    motions = R @ null_space(A @ R)
-    pinned = qr(motions.T, pivoting=True, mode="r")[1][: motions.shape[1]]
-    rest = np.setdiff1d(np.arange(len(f)), pinned)
-    scale = 1.0 / np.sqrt(M.diagonal()[rest])
-    scaled = csr_array(M[rest][:, rest].multiply(scale[:, None]).multiply(scale))
-    factor = splu(scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-
-    def inverse(b: np.ndarray) -> np.ndarray:
-        x = np.zeros(len(b))
-        x[rest] = scale * factor.solve(scale * b[rest])
-        return x
-
+    inverse = pinned_inverse(M, R @ null_space(A @ R))
     u, force = np.zeros(len(f)), np.zeros(len(row))
     for k in range(8):
         u += inverse(f - K @ u - A.T @ (force + penalty * (A @ u - gap[active])))
@@ -199,51 +226,12 @@ def close(
     return force, u
 
 
-def solve_near(
-    F: np.ndarray,
-    d: np.ndarray,
-    G: np.ndarray,
-    e: np.ndarray,
-    gap: np.ndarray,
-    active: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """``solve_qp``, without gaps that are far at first: they would spoil its scale."""
-    reach = np.quantile(np.abs(gap), [0.25, 0.5, 0.75])
-    for near in (*(gap <= FARTHER * r for r in reach), np.ones(len(gap), dtype=bool)):
-        for _ in range(20):
-            lam = np.zeros(len(gap))
-            guess = None if active is None else active[near]
-            try:
-                lam[near], alpha = solve_qp(F[np.ix_(near, near)], d[near], G[:, near], e, guess)
-            except UnsettledError:
-                if near.all():
-                    raise
-                break
-            s = F @ lam - d - G.T @ alpha
-            entered = ~near & (s < 0.0)
-            if not entered.any():
-                return lam, alpha
-            near = near | entered
-    raise UnsettledError("rows that were far came in again and again")
+def interior_point(
+    F: np.ndarray, d: np.ndarray, G: np.ndarray, e: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """λ, where λ > s, and α at the end of Mehrotra's predictor and corrector; None without a λ.
 
-
-def solve_qp(
-    F: np.ndarray, d: np.ndarray, G: np.ndarray, e: np.ndarray, active: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """min ½λᵀFλ − dᵀλ, Gλ = e, λ ≥ 0, which has a solution.
-
-    Args:
-        F: Positive definite on the null space of G, positive diagonal.
-        d: Shape ``(m,)``.
-        G: Shape ``(r, m)``.
-        e: Shape ``(r,)``.
-        active: A first guess of what carries force, instead of an interior point's.
-
-    Returns:
-        λ, and α with s = Fλ − d − Gᵀα ≥ 0.
-
-    Raises:
-        UnsettledError: The active set did not settle.
+    SIAM J. Optim. 2, 1992.
     """
     scale = np.sqrt(np.diag(F))
     F, d, G = F / np.outer(scale, scale), d / scale, G / scale
@@ -252,28 +240,19 @@ def solve_qp(
     felt = sigma > UNFELT * sigma.max(initial=0.0)
     U, sigma, G = U[:, felt], sigma[felt], Vt[felt]
     if np.linalg.norm(e - U @ (U.T @ e)) > 1e-8 * np.linalg.norm(e):
-        raise UnsettledError("Gλ = e has no solution")
+        return None
     e = U.T @ e / sigma
-    if active is None:
-        active = interior_point(F, d, G, e)
-    lam, alpha = settle(F, d, G, e, active)
-    return lam / scale, U @ (alpha / sigma)
-
-
-def interior_point(F: np.ndarray, d: np.ndarray, G: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """Where λ > s at the end of Mehrotra's predictor and corrector (SIAM J. Optim. 2, 1992)."""
     m, r = len(d), len(e)
     size = max(np.abs(d).max(initial=0.0), np.abs(e).max(initial=0.0), 1e-300)
     d, e = d / size, e / size
     lam, s, alpha = np.ones(m), np.ones(m), np.zeros(r)
-    regular = 1e-14 * np.eye(r)
     for _ in range(120):
         dual, primal = F @ lam - d - G.T @ alpha - s, G @ lam - e
         mean = lam @ s / m
         if mean < 1e-22:
             break
         H = np.linalg.inv(F + np.diag(s / lam))
-        schur = G @ H @ G.T + regular
+        schur = G @ H @ G.T + 1e-14 * np.eye(r)
 
         def step(target: np.ndarray) -> tuple[np.ndarray, ...]:
             right = -dual - s + target / lam  # noqa: B023
@@ -289,42 +268,9 @@ def interior_point(F: np.ndarray, d: np.ndarray, G: np.ndarray, e: np.ndarray) -
         if not np.isfinite(length) or length < 1e-12:
             break
         lam, alpha, s = lam + length * dl, alpha + length * da, s + length * ds
-    return lam > s
+    return lam * size / scale, lam > s, U @ (alpha * size / sigma)
 
 
 def _longest(x: np.ndarray, dx: np.ndarray) -> float:
     falling = dx < 0.0
     return float(min(1.0, (-x[falling] / dx[falling]).min(initial=1.0)))
-
-
-def settle(
-    F: np.ndarray, d: np.ndarray, G: np.ndarray, e: np.ndarray, active: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Primal-dual active set from a guess, each set by a dense saddle point system."""
-    r, seen = len(e), set()
-    size = max(np.abs(e).max(initial=0.0), np.abs(d).max(initial=0.0))
-    for _ in range(60):
-        n = int(active.sum())
-        A, B = F[np.ix_(active, active)], G[:, active]
-        saddle = np.block([[A, -B.T], [B, np.zeros((r, r))]])
-        right = np.concatenate((d[active], e))
-        x = np.linalg.lstsq(saddle, right, rcond=1e-13)[0]
-        x += np.linalg.lstsq(saddle, right - saddle @ x, rcond=1e-13)[0]
-        lam = np.zeros(len(d))
-        lam[active], alpha = x[:n], x[n:]
-        s = F @ lam - d - G.T @ alpha
-        s[active] = 0.0
-        balance = np.abs(G @ lam - e).max(initial=0.0)
-        noise = NO_SIGN * max(np.abs(lam).max(initial=0.0), 1e-12 * size)
-        wrong = (active & (lam < -noise)) | (~active & (s < -noise))
-        if not wrong.any():
-            largest = max(np.abs(e).max(initial=0.0), np.abs(lam).max(initial=0.0))
-            if balance > 1e-8 * max(largest, 1e-12 * size):
-                raise UnsettledError(f"Gλ = e is off by {balance:.1e}")
-            return lam, alpha
-        if active.tobytes() in seen:  # a cycle: one at a time
-            worst = np.argmax(np.where(wrong, np.maximum(-lam, -s), -np.inf))
-            wrong = np.arange(len(d)) == worst
-        seen.add(active.tobytes())
-        active = active ^ wrong
-    raise UnsettledError("the active set did not settle")
