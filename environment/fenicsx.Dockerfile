@@ -5,4 +5,5 @@ FROM ghcr.io/fenics/dolfinx/dolfinx:${DOLFINX}
 ENV DEB_PYTHON_INSTALL_LAYOUT=deb_system OMP_NUM_THREADS=1
 COPY . /opt/tfeti_dolfinx
 WORKDIR /opt/tfeti_dolfinx
+# hadolint ignore=DL3013
 RUN python3 -m pip install --no-cache-dir --break-system-packages ".[gmsh,plot,progress,test]"

@@ -133,8 +133,8 @@ CONVERTED = ROOT / "docs/howto/linear_problem.md"
 @pytest.mark.parametrize("program", range(2), ids=["2D", "3D"])
 def test_a_linear_problem_becomes_contact_in_nine_lines(own_folder, program):
     lines = blocks(CONVERTED, "diff")[program].splitlines()
-    assert sum(line[0] in "+-" and len(line) > 1 for line in lines) <= 9
-    before, after = ("\n".join(line[1:] for line in lines if line[0] != other) for other in "+-")
+    assert sum(line[:1] in ("+", "-") and len(line) > 1 for line in lines) <= 9
+    before, after = ("\n".join(line[1:] for line in lines if line[:1] != other) for other in "+-")
     compile(before, "before", "exec")
     run_program(after + "\nassert problem.solution.contact().force.sum() > 0.0", "after")
 
@@ -258,7 +258,8 @@ def test_the_package_installs(serial_only, tmp_path):
 def test_one_version():
     citation = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     changes = re.search(r"^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert citation[1] == changes[1] == tfeti.__version__
+    recipe = re.search(r'version: "(.*?)"', (ROOT / "environment/conda/recipe.yaml").read_text())
+    assert citation[1] == changes[1] == recipe[1] == tfeti.__version__
 
 
 def test_the_report_s_fields_are_documented():
