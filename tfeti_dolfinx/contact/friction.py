@@ -32,17 +32,11 @@ NOT_NEGATIVE = Range("a number, 0 or more", lambda value: value >= 0.0)
 
 
 class FrictionLaw:
-    """One or two values of a bound on the tangential traction.
+    """One or two values of a bound on the tangential traction."""
 
-    Attributes:
-        what: Name of the attribute that has the values.
-        kind: Kind of the bound.
-        direction: Vector along which the first of two values holds.
-    """
-
-    what: ClassVar[str]
+    what: ClassVar[str]  # name of the attribute that has the values
     kind: ClassVar[Friction]
-    direction: Sequence[float] | None
+    direction: Sequence[float] | None  # along which the first of two values holds
 
     def __post_init__(self) -> None:
         what, count = f"{type(self).__name__}: {self.what}", len(self.values)

@@ -45,19 +45,13 @@ GEOMETRY, CURVED = "geometry", "curved"
 
 @dataclass(frozen=True, kw_only=True)
 class ContactPartner:
-    """An obstacle, or a pair of surfaces. All methods are collective.
+    """An obstacle, or a pair of surfaces. All methods are collective."""
 
-    Attributes:
-        gap: The gaps of its conditions: those of the geometry, or given ones.
-        friction: Its law of friction.
-        reach: Distance up to which conditions have rows at first; None: 5 % of the surface.
-        name: Name for messages.
-    """
-
-    gap: Gap = GEOMETRY
+    gap: Gap = GEOMETRY  # the gaps of its conditions: those of the geometry, or given ones
     friction: FrictionLaw | None = None
+    # distance up to which conditions have rows at first; None: 5 % of the surface
     reach: float | None = None
-    name: str = ""
+    name: str = ""  # for messages
 
     def _check_data(self, default_name: str) -> None:
         """Give the contact a name if it has none, and check what is known at once."""
@@ -73,27 +67,16 @@ class ContactPartner:
         raise NotImplementedError
 
     def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
-        """Return the conditions.
+        """Return the conditions; raise an InputError where a surface, shape, gap or law is unfit.
 
-        Args:
-            dofs: Dof maps.
-            contact: Index of the contact.
-            reach: Conditions with a larger gap are out of reach; those of surfaces three times as
-                far apart are not made.
-            depth: Largest initial overlap of two surfaces, and how far a given gap replaces it.
-                A body may lie in an obstacle as deep as it likes.
-
-        Raises:
-            InputError: Surfaces, shape, gap or friction do not fit.
+        Conditions with a gap above the reach are out of reach; those of surfaces three times as far
+        apart are not made. The depth is the largest initial overlap of two surfaces, and how far a
+        given gap replaces it; a body may lie in an obstacle as deep as it likes.
         """
         raise NotImplementedError
 
     def first_reach(self, decomposition: Decomposition) -> float:
-        """Return the distance up to which conditions have rows at first.
-
-        Raises:
-            InputError: A surface is unknown or empty, or gap or reach do not fit.
-        """
+        """Return the first reach; raise an InputError where it, surfaces or gap do not fit."""
         facets = [surface_facets(decomposition, name) for name in self.surfaces]
         self._check_gap()
         size, reach = min(extent(decomposition, surface) for surface in facets), self.reach
@@ -123,15 +106,8 @@ class ContactPartner:
         """Return gaps of its conditions, as ``gap=`` and the geometry have them, shape ``(n,)``.
 
         No search, no integral: a given gap is taken at the nodes, which is the mean of its linear
-        interpolant.
-
-        Args:
-            dofs: Dof maps.
-            records: The conditions, of any ``gap=``.
-            depth: A given gap replaces that of the geometry up to this one.
-
-        Raises:
-            InputError: A given gap is no number somewhere, or surfaces overlap too deep.
+        interpolant; it replaces that of the geometry up to a depth. Raise an InputError where it is
+        no number somewhere, or surfaces overlap too deep.
         """
         if self.gap == CURVED:
             return records.curved_gap

@@ -158,11 +158,7 @@ class RigidBody:
             )
 
     def check_dimension(self, gdim: int, whose: str) -> None:
-        """Raise if shape, point or free motions are not those of a space of this dimension.
-
-        Raises:
-            InputError: It says which.
-        """
+        """Raise an InputError if shape, point or free motions are not those of this dimension."""
         if isinstance(self.shape, Placed):
             self.shape.check_dimension(gdim, whose)
         wrong = [name for name in self.free if name not in MOTIONS[gdim]]
@@ -210,9 +206,8 @@ class RigidBody:
     def motion_and_load(self, gdim: int, time: float) -> tuple[Array, Array]:
         """Return the motion by the law, free ones 0, and force and moment, both of shape ``(k,)``.
 
-        Raises:
-            InputError: A value does not fit, a motion by the law is free, or a force acts on one
-                that is not free.
+        Raise an InputError where a value does not fit, a motion by the law is free, or a force acts
+        on one that is not free.
         """
         found = []
         for names, free in ((("displacement", "rotation"), False), (("force", "moment"), True)):

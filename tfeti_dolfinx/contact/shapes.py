@@ -38,11 +38,9 @@ class Shape(Protocol):
 
     def distance(self, x: Array) -> Array:
         """Signed distance, positive on the free side, shape ``(n,)``."""
-        ...
 
     def gradient(self, x: Array) -> Array:
         """Gradient of the signed distance, shape ``(3, n)``."""
-        ...
 
 
 def _vector(values: Point, what: str) -> Array:

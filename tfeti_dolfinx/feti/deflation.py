@@ -96,11 +96,9 @@ class Deflation(Protocol):
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
         """Return M_f, which is taken over, with these motions. Collective."""
-        ...
 
     def destroy(self) -> None:
         """Free what belongs to it. Collective."""
-        ...
 
 
 class SoftModes:

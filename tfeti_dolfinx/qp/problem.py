@@ -29,11 +29,9 @@ class FaceOperator(Protocol):
 
     def __call__(self, x: Array) -> Array:
         """A x. Collective."""
-        ...
 
     def destroy(self) -> None:
         """Free what it holds. Collective."""
-        ...
 
 
 @dataclass
@@ -314,7 +312,6 @@ class Monitor(Protocol):
             projected_gradient: ‖g^P‖ there.
             equality: ‖Q x‖ there, how far Gλ = e is from being met; negative: not computed.
         """
-        ...
 
 
 def no_monitor(

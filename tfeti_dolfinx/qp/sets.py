@@ -146,23 +146,18 @@ class FeasibleSet(Protocol):
 
     def project(self, x: Array) -> Array:
         """P_Ω(x), the nearest point of Ω."""
-        ...
 
     def split(self, x: Array, g: Array) -> tuple[Array, Array]:
         """Free gradient φ and chopped gradient β at x ∈ Ω; φ + β is the projected gradient."""
-        ...
 
     def max_step(self, x: Array, p: Array) -> float:
         """Return the largest α with x − α p ∈ Ω, maybe infinite."""
-        ...
 
     def face(self, x: Array, g: Array) -> Face:
         """Return the face of x ∈ Ω, given the gradient there."""
-        ...
 
     def onto(self, x: Array, status: Array) -> Array:
         """P_Ω(x), but on their bounds where rows are open, and on the boundary where they slip."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,6 @@ class GeneralisedInverse(Protocol):
 
     def solve(self, b: Array) -> Array:
         """K⁺ b, shape ``(n,)``."""
-        ...
 
 
 # from K, its kernel, the unknowns of fixing nodes and a prefix of options to K⁺

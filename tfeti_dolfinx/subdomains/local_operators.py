@@ -212,11 +212,9 @@ class LocalOperator(Protocol):
 
     def prepare(self) -> None:
         """Make what ``mult`` needs; errors are raised by ranks together."""
-        ...
 
     def mult(self, w: Array, out: Array) -> None:
         """out = diag(A_s) w, shapes ``(t,)``; w stays as it is, all of out is set."""
-        ...
 
 
 class GroupedOperator:

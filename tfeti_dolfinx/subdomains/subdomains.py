@@ -385,7 +385,6 @@ class SubdomainMethod(Protocol):
 
     def assembly(self, dofs: TornDofs, decomposition: Decomposition) -> FiniteElements:
         """Return stiffness and load of the subdomains. Collective."""
-        ...
 
 
 def subdomain_data(
