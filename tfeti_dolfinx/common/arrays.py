@@ -106,9 +106,7 @@ def as_petsc_matrix(A: Any) -> PETSc.Mat:
 class LocalMatrix:
     """A CSR matrix for many products: PETSc's, without scipy's checks of both factors.
 
-    Attributes:
-        shape: Its shape.
-        count: Number of its entries.
+    ``count`` is the number of its entries.
     """
 
     def __init__(self, A: csr_array | Entries) -> None:

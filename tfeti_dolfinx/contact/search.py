@@ -27,16 +27,10 @@ class ContactSearch:
 
     Conditions out of a contact's reach have no rows at first; ``take_in_overlapping`` gives them to
     those that a displacement violates, ``widen`` to those that may hold a body yet. Creation raises
-    an InputError where a pair is there twice, or a contact raises it.
-
-    Args:
-        contacts: Obstacles and pairs.
-        dofs: Dof maps.
-        stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``; None: sides are
-            decided.
-        origin: Displacement in primal order at which the mesh is; None: 0. Gaps are those of the
-            total displacement.
-        tools: The rigid bodies, where they are placed.
+    an InputError where a pair is there twice, or a contact raises it. ``stiffness`` is the block of
+    K of each primal node, shape ``(num_nodes, bs, bs)``; without it sides are decided. ``origin``
+    is the displacement in primal order at which the mesh is, by default 0: gaps are those of the
+    total one. Tools are where they are placed.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.

@@ -36,23 +36,15 @@ class CoarseSpace(Coarse):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
 
     G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
-
-    Args:
-        B: Dual rows × trace unknowns.
-        subdomains: This rank's Blocks. The constructor and all methods are collective.
-        bounded: Local rows with λ ≥ 0.
-        rubbing: Local rows of friction.
-        prefix: Prefix of the factor's PETSc options.
+    ``bounded`` are local rows with λ ≥ 0, ``rubbing`` those of friction. Creation and all methods
+    are collective.
 
     Attributes:
-        subdomains: This rank's Blocks.
         dimension: r, the dimension of the kernel of K.
         e: (R T)ᵀ f, shape ``(r,)``.
         motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``; ``work``
             is the product of their transpose with an r-vector.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
-        bounded: Local rows with λ ≥ 0.
-        rubbing: Local rows of friction.
         row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
             row over it gives lengths. Shape ``(m_local,)``.
         bodies: Motions of the bodies.

@@ -84,15 +84,10 @@ class Balanced:
 
 
 class Deflation(Protocol):
-    """A coarse space of a preconditioner on faces.
+    """A coarse space of a preconditioner on faces."""
 
-    Attributes:
-        count: Number of its motions, of all subdomains.
-        factors: Makes the factors of faces, and counts them.
-    """
-
-    count: int
-    factors: FaceFactors
+    count: int  # number of its motions, of all subdomains
+    factors: FaceFactors  # makes the factors of faces, and counts them
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
         """Return M_f, which is taken over, with these motions. Collective."""
@@ -109,10 +104,6 @@ class SoftModes:
     alone, and none of them is taken; some would be worse than all or none. Where every subdomain
     has all its rigid motions in the kernel there are none, and nothing is multiplied; else M_f is
     three times.
-
-    Attributes:
-        count: Number of soft motions of all subdomains.
-        factors: Makes the factors of faces, and counts them.
     """
 
     def __init__(

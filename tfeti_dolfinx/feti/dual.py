@@ -82,19 +82,9 @@ class Dual:
 
     Creation raises an InputError where squares of stiffness, load or values leave the range of
     floating point; a NoSolutionError where the load moves a body that nothing holds; a FactorError
-    where a matrix could not be factored.
-
-    Args:
-        constraints: B and c.
-        subdomains: This rank's Blocks.
-        body_names: Names of all bodies.
-        mode_names: Names of their candidate modes.
-        preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, or None.
-        options_prefix: Prefix of all PETSc options.
-        feasible: Makes the set of multipliers from B and c; default ``contact_set``.
-        without: Mechanisms that are switched off (``options.MECHANISMS``).
-        recycle: Most directions of earlier solves; ``"auto"``: none before ``learn``.
-        dimension: That of the space.
+    where a matrix could not be factored. ``body_names`` and ``mode_names`` are for messages;
+    ``without`` names mechanisms that are switched off (``options.MECHANISMS``); ``recycle`` is how
+    many directions of earlier solves are kept, ``"auto"``: none before ``learn``.
 
     Attributes:
         F: B K⁺ Bᵀ.

@@ -63,9 +63,8 @@ def admissible(
     3. Contact loses max μᵀq − λᵀq, μ ∈ Ω, by q = Bv − c; the maximum is at P_Ω(λ + tq), t ``far``
        beside the forces.
 
-    Returns:
-        δ on this rank's trace unknowns; this rank's part of what contact loses, and of what closed
-        rows still miss, as they depend on each other, times their forces.
+    Return δ on this rank's trace unknowns; this rank's part of what contact loses, and of what
+    closed rows still miss, as they depend on each other, times their forces.
     """
     constraints, comm = dual.constraints, dual.coarse.comm
     contact = constraints.sets.contact

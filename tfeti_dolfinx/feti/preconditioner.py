@@ -66,13 +66,9 @@ class FacePreconditioner:
     column 1 and A the entry 1/κ. Its weight in D is 1/(κσ), σ the diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ,
     which makes M_f the inverse where F is 1/σ. So it is W_κ⁻¹(B_f D⁻¹ A D⁻¹B_fᵀ + κσ²)W_κ⁻¹ with
     W_κ = W + κσ. With springs a displacement is followed by ρ, of which κσρ is how far they move.
-
-    Args:
-        whole: B D⁻¹ A D⁻¹Bᵀ on all rows, A the Schur complements, or the stiffness on the trace;
-            with the metric of smoothing, or without.
-        constraints: B and D. The constructor is collective.
-        diagonal: That of K on the local trace unknowns, the mean at each node.
-        prefix: Prefix of the factor's PETSc options.
+    ``whole`` is B D⁻¹ A D⁻¹Bᵀ on all rows, A the Schur complements, or the stiffness on the trace;
+    with the metric of smoothing, or without. ``diagonal`` is that of K on the local trace unknowns,
+    the mean at each node. Creation is collective.
 
     Attributes:
         whole: A, and B D⁻¹ = B_D.

@@ -96,17 +96,9 @@ def min_norm_correction(
     closes them. Contact rows are not so to each other, and may depend on each other: conjugate
     gradients for least squares (Björck, Numerical Methods for Least Squares Problems, SIAM 1996,
     section 7.4), to ``tol`` of the first gradient. With the usual eigenvalues of B_f D⁻¹ B_fᵀ, 0.6
-    to 2, they take about 15 steps.
-
-    Args:
-        constraints: B and D.
-        w: What rows miss, zero on rows that are not asked about, shape ``(m,)``.
-        closed: Flags of the local contact rows that are, in the order of ``sets.contact``.
-        tol: Relative tolerance.
-        max_it: Most steps.
-
-    Returns:
-        On this rank's trace unknowns, shape ``(Σ t_s,)``.
+    to 2, they take about 15 steps. w is what rows miss, zero on rows that are not asked about,
+    ``closed`` flags of the local contact rows that are, in the order of ``sets.contact``. Return v
+    on this rank's trace unknowns, shape ``(Σ t_s,)``.
     """
     D, contact = constraints.weights, constraints.sets.contact
     comm = constraints.B.getComm().tompi4py()

@@ -253,8 +253,7 @@ def _null_space(blocks: Array, i: Array, j: Array, held: Array) -> Iterator[tupl
 class Bodies:
     """Motions of the bodies, in coordinates in which every motion has the mean square 1.
 
-    Args:
-        subdomains: This rank's Blocks. The constructor is collective.
+    Creation is collective.
 
     Attributes:
         count: Number of bodies on all ranks.

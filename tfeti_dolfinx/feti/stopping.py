@@ -191,25 +191,17 @@ class Tolerances:
 class Accuracy(StoppingRule):
     """Stops a solver when the displacement of each body is right to rtol, in the maximum norm.
 
-    A body's error is estimated as what closes its jumps, plus what that does in energy, turned
-    into a displacement by the ratio of the two that the solution itself and its last change have
-    shown. Stiffness, units and gaps that stay open do not enter. Residuals only decide when to
-    look: the first look is taken early, to learn how far things move. Creation is not
-    collective; ``examine`` is, and costs one solve in each subdomain.
-
-    Args:
-        dual: The dual problem.
-        rtol: Relative tolerance of displacements and forces.
-        atol: A length that errors may have whatever moves.
-        scale: b₀, the norm of the residual at the start, and what rounding leaves of it.
-        norm: ‖F‖, or an estimate; residuals over it are errors of multipliers.
-        limits: What rtol does not say.
+    A body's error is estimated as what closes its jumps, plus what that does in energy, turned into
+    a displacement by the ratio of the two that the solution itself and its last change have shown.
+    Stiffness, units and gaps that stay open do not enter. Residuals only decide when to look: the
+    first look is taken early, to learn how far things move. Creation is not collective; ``examine``
+    is, and costs one solve in each subdomain. ``atol`` is a length that errors may have whatever
+    moves, ``scale`` b₀, the norm of the residual at the start, and what rounding leaves of it;
+    ``norm`` is ‖F‖, or an estimate: residuals over it are errors of multipliers.
 
     Attributes:
-        rtol: Relative tolerance.
         tolerance: Norm of the residuals from which on one looks (again).
         drifted: Whether the solver's gradient has to be made anew.
-        norm: ‖F‖, or an estimate.
         recovered: What the last look has recovered.
         u: This rank's part of its displacement, shape ``(n,)``.
         looks: How many looks there were.

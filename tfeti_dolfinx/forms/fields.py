@@ -191,16 +191,11 @@ class StressRecovery:
     """σ* − σ_h and ε* − ε_h, σ* and ε* recovered from the cells around each node.
 
     A patch is all cells of one material of one body around a node, on both sides of tears. For
-    displacements of degree 1 a linear function is fitted to the values at the cells' midpoints,
-    and taken at the node (superconvergent patch recovery: Zienkiewicz, Zhu, Int. J. Numer. Methods
-    Eng. 33, 1992); for higher degrees the values of the cells at the node are averaged.
-    Creation and all methods are collective.
-
-    Args:
-        u: Displacement; later values of it are read at each call of ``squares``.
-        sigma: Its stress in UFL, 3×3.
-        dofs: Dof maps.
-        thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
+    displacements of degree 1 a linear function is fitted to the values at the cells' midpoints, and
+    taken at the node (superconvergent patch recovery: Zienkiewicz, Zhu, Int. J. Numer. Methods Eng.
+    33, 1992); for higher degrees the values of the cells at the node are averaged. Creation and all
+    methods are collective. Later values of u are read at each call of ``squares``; σ_h is its
+    stress in UFL, 3×3, and the thickness multiplies areas.
 
     Attributes:
         cells: Space of numbers for cells.

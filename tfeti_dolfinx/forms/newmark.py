@@ -61,11 +61,7 @@ class Motion:
 class Inertia:
     """Mass of the bodies, and where a time step begins. Creation and all methods are collective.
 
-    Args:
-        mass: Bilinear form of the mass M.
-        V: The space of displacements.
-        decomposition: The torn mesh.
-        compiled: Compiles the form of a name.
+    ``compiled`` compiles the form of a name.
 
     Attributes:
         motion: Where the step begins.

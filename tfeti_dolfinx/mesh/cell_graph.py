@@ -40,10 +40,6 @@ class CellGraph:
     Creation and all methods are collective. No rank holds more than its own cells and these ghosts,
     which come after its own.
 
-    Args:
-        mesh: This rank's share.
-        comm: Its ranks.
-
     Attributes:
         comm: Ranks that share the cells.
         num_cells: Cells of this rank.

@@ -108,14 +108,10 @@ class TornDofs:
     A *node* is a point with ``bs`` unknowns. *Primal* numbering sorts a rank's nodes by subdomain.
     A *group* is the set of all torn copies of a node, on any rank; it is owned by the rank of its
     lowest subdomain. Creation and all methods that say so are collective. Creation raises an
-    InputError where ``V`` is not a space for displacements on the torn mesh.
-
-    Args:
-        V: Lagrange space on the torn mesh, scalar or blocked.
-        decomposition: The torn mesh.
+    InputError where ``V`` is not a space for displacements on the torn mesh. The space is scalar or
+    blocked.
 
     Attributes:
-        decomposition: The torn mesh.
         bs: Unknowns per node.
         num_nodes: Primal nodes of this rank, n.
         num_groups: Groups owned by this rank, g.

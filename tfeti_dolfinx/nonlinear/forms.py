@@ -27,14 +27,8 @@ class NewtonForms(Forms):
     """Matrix J(u) and load J u − F(u) of the linearised problem at u.
 
     Its solution is the next displacement, not an increment, which would be rounding of u in the
-    end. Creation and all methods are collective.
-
-    Args:
-        J: Derivative of F.
-        F: Residual.
-        as_forms: The other arguments of ``Forms``.
-        u: The displacement.
-        finite: Whether forms are integrated over the mesh as it was, wherever it is.
+    end. Creation and all methods are collective. J is the derivative of the residual F; ``finite``
+    forms are integrated over the mesh as it was, wherever it is.
 
     Attributes:
         kept: Whether matrix and factors stay as they are, though u changes.
@@ -100,12 +94,6 @@ class InertialNewtonForms(NewtonForms):
     w = u + τv, or what takes its place: R(u⁺) = (F(u) + F(u⁺))/2 + 2M(u⁺ − w)/τ², and its
     derivative J/2 + 2M/τ². M is that of the bodies where they were. Creation and all methods are
     collective.
-
-    Args:
-        mass: Bilinear form of the mass M.
-        as_forms: Arguments of ``NewtonForms``.
-        u: The displacement.
-        finite: As there.
 
     Attributes:
         inertia: M, and where the step begins; its loads are −F.

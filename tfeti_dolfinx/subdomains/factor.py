@@ -52,11 +52,9 @@ class CholeskyFactor:
     """A = L Lᵀ of a symmetric positive definite matrix on one rank.
 
     Creation raises a NotPositiveDefiniteError where A is not positive definite; a FactorError where
-    there is no memory for the factor, PETSc has no such solver, or it fails.
-
-    Args:
-        A: scipy sparse matrix or ``Entries``, both triangles, shape ``(n, n)``; may go after it.
-        prefix: Prefix of the PETSc options ``pc_factor_...`` and ``mat_...`` that it heeds.
+    there is no memory for the factor, PETSc has no such solver, or it fails. A is a matrix of scipy
+    or ``Entries``, both triangles, and may go after it; PETSc's options ``pc_factor_...`` and
+    ``mat_...`` with the prefix are heeded.
     """
 
     def __init__(self, A: Any, prefix: str = "tfeti_sub_") -> None:

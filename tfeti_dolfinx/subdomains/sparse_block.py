@@ -45,7 +45,6 @@ class Stiffness:
     where a factor could not be made. K is scipy CSR, shape ``(n, n)``, and becomes its own.
 
     Attributes:
-        K: The stiffness.
         kernel: R, shape ``(n, r)``.
         diagonal: Diagonal of K.
         entries: Entries of the factor; of an inverse that the user brings, as if it were dense.
@@ -254,15 +253,10 @@ class SparseBlock(Block):
     They belong to its stiffness, which it may share with Blocks that are equal to it. The numbering
     of the stiffness is that of the first of them. Creation raises an InputError where K is not
     symmetric, not finite or not positive semidefinite, or the load is not finite; a FactorError
-    where a factor could not be made.
-
-    Args:
-        data: The subdomain.
-        how: How inverses are made.
-        equals: Finds the stiffness among those of equal subdomains; without it, it shares none.
+    where a factor could not be made. ``equals`` finds the stiffness among those of equal
+    subdomains; without it, it shares none.
 
     Attributes:
-        equals: As given.
         place: Unknown of the stiffness for each of its own, shape ``(n,)``.
     """
 

@@ -148,11 +148,7 @@ class Subdomains:
         self._read_trace()
 
     def update(self, f: Array) -> None:
-        """Replace the load, shape ``(n,)``. Collective.
-
-        Raises:
-            InputError: It does not fit.
-        """
+        """Replace the load, shape ``(n,)``; raise an InputError if it does not fit. Collective."""
         self._pinv_load = None
         with raised_on_all_ranks(self.comm):
             for block, part in zip(self.blocks, self.dof_parts, strict=True):
@@ -375,13 +371,9 @@ class FiniteElements:
 
 @runtime_checkable
 class SubdomainMethod(Protocol):
-    """Another method than finite elements on some volumes.
+    """Another method than finite elements on some volumes."""
 
-    Attributes:
-        volumes: Their names or tags; none: all.
-    """
-
-    volumes: tuple[str | int, ...]
+    volumes: tuple[str | int, ...]  # their names or tags; none: all
 
     def assembly(self, dofs: TornDofs, decomposition: Decomposition) -> FiniteElements:
         """Return stiffness and load of the subdomains. Collective."""
