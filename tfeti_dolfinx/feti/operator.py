@@ -26,7 +26,7 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 def near_stiffness(blocks: Sequence[SparseBlock], rigid: int = 0) -> tuple[csr_array, Array]:
     """K between the trace unknowns of each subdomain and those that share a cell with them.
 
-    Of ``rigid`` trace unknowns of rigid bodies, which come behind, it is 0. Return it on the t trace
+    Of ``rigid`` trace unknowns of rigid bodies, which come behind, it is 0. Return it on the trace
     unknowns of this rank, as ``Subdomains`` has them, and after them on the t_n ones next to them;
     and the mean of the diagonal of K at each node of these, shape ``(t_n,)``.
     """
