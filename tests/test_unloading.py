@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from bodies import boxes, drawn, held, stacked, two_body_problem
+import ufl
+from bodies import boxes, drawn, held, sided, stacked, two_body_problem
 from dolfinx import fem
 from reference.untorn import on_plane, untorn_box
-from scenes import clamp, decomposed, displacement, forms, hooke
+from scenes import clamp, decomposed, displacement, forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
 
@@ -194,6 +195,32 @@ def test_a_body_that_is_lifted_as_a_whole_has_no_forces():
     lift = np.array([0.003, 0.003, 0.015])
     assert np.abs(scene.solve(0.0, lift) - lift).max() <= 1e-6 * 0.015
     scene.problem.destroy()
+
+
+@pytest.mark.parametrize(
+    ("cell", "gap", "friction"),
+    [("triangle", 0.0, None), ("tetrahedron", 1 / 3, tfeti.Coulomb(0.3))],
+)
+def test_a_body_brought_to_another_only_touches_it(cell, gap, friction):
+    """Forces are rounding, for which nothing is solved: at first, and back from a pressure."""
+    d = stacked(cell, 3, 4, 4 if friction is None else 2, upper=(0.1, 0.9), gap=gap)
+    value = fem.Constant(d.mesh, np.zeros(d.mesh.geometry.dim))
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, value.ufl_shape))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    problem = tfeti.ContactProblem(
+        ufl.inner(hooke()(u), strain(v)) * ufl.dx,
+        ufl.ZeroBaseForm((v,)),
+        [clamp(V, d.facets("lower bottom")), clamp(V, d.facets("upper top"), value)],
+        [sided("upper bottom", "lower top", reach=1.0, friction=friction)],
+        d,
+    )
+    for pressed in (0.0, 0.01, 0.0):
+        value.value[0], value.value[-1] = 0.01 * (friction is None), -gap - pressed
+        problem.solve()
+        if not pressed:
+            assert problem.report.iterations <= 2
+            assert problem.solution.contact().resultant.force == pytest.approx(0, abs=1e-12)
+    problem.destroy()
 
 
 @pytest.mark.parametrize(

@@ -227,7 +227,9 @@ class Accuracy(StoppingRule):
         reference, self._rounding = scale
         super().__init__(max(rtol**0.5 * reference, atol, self._rounding))
         self.norm = norm or 1.0
-        self._small = 0.01 * max(rtol * reference, self._rounding)
+        # where nothing drives any force, rows that only just touch have forces that are rounding
+        drives = reference > self._rounding
+        self._small = 0.01 * max(rtol * reference, self._rounding) if drives else self._rounding
         self.looks, self._stalls, self._claimed = 0, 0, 1.0
         self.recovered: Recovered | None = None
         self._before: Measures | None = None

@@ -56,7 +56,7 @@ class CoulombParameters:
     no_force: float = 1e-13
     # of the largest forces of normals on a body: those of a lighter one count as so large
     light: float = 1e-6
-    rounding: float = 2e-16  # of ‖F‖‖λ‖: no residual is less
+    rounding: float = 2e-16  # of ‖F‖‖λ‖, or of ‖d‖: no residual is less
 
 
 @dataclass(frozen=True)
@@ -348,7 +348,8 @@ class NewtonOnLaw:
         target = min(self._share * self._rtol * size, parameters.finer * residual, aim)
         # Step 3: Newton's method, or the path of growing friction where bodies are held
         end, steps = None, 0
-        if target > parameters.rounding * norm * norm_over(dual.coarse.comm, start[0]):
+        terms = max(norm * norm_over(dual.coarse.comm, start[0]), norm_over(dual.coarse.comm, qp.d))
+        if target > parameters.rounding * terms:
             end, steps = newton_on_law(program, first, target, parameters.newton)
             if end is None and not dual.coarse.unheld.free.any():
                 loose = parameters.path_target * residual
