@@ -25,8 +25,8 @@ ROOT = Path(__file__).resolve().parents[1]
 MPI_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
 FILE = "«file»"  # among words of a command: where what it finds is to be written
 # of the report; the rest of the total is the demo's own: forms, closed forms, output
-STAGES = ("mesh", "assembly", "contact", "gluing", "subdomains", "dual", "qp", "recovery")
-COLUMNS = {"subdomains": "K⁺"}  # a table may have a column for their number
+STAGES = ("mesh", "assembly", "contact", "constraints", "factors", "coarse", "solve", "recovery")
+
 # lines of what a program has printed that are shown where it fails
 SHOWN = 20
 FEW = 8  # values that all can stand beside an axis
@@ -226,8 +226,8 @@ def solve_seconds(report: dict[str, Any]) -> float:
 
 
 def stage_seconds(report: dict[str, Any]) -> dict[str, float]:
-    """Columns of a table: seconds of each stage, that of the subdomains by what it makes."""
-    return {COLUMNS.get(stage, stage): report["seconds"].get(stage, 0.0) for stage in STAGES}
+    """Columns of a table: seconds of each stage."""
+    return {stage: report["seconds"].get(stage, 0.0) for stage in STAGES}
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:

@@ -74,6 +74,7 @@ def test_a_subdomain_is_on_one_rank_and_ranks_have_about_equal_shares():
 
 
 def test_disconnected_subdomains_are_split_and_reported(caplog):
+    caplog.set_level("INFO")
     d = decomposed("quadrilateral", n=4, subdomains=lambda x: np.abs(x[0] - 0.5) > 0.25)
     assert d.split == {1: [1, 2]}
     assert d.num_subdomains == 3

@@ -100,6 +100,22 @@ def test_a_page_says_what_a_demo_finds(name, demo, pattern, word):
     assert all(abs(error) <= float(percent) / 100 for error in errors.values()), errors
 
 
+def test_iterations_are_as_pages_say(serial_only):
+    """Nearly constant from 8 to 64 subdomains of a size; several times as many with smalse."""
+    for name, words in (
+        ("README", "stay nearly constant"),
+        ("docs/guide/speed", "nearly constant"),
+    ):
+        assert words in page(name)
+    assert "`smalse` takes several times as many iterations" in page("docs/guide/speed")
+    few, many, smalse = (
+        demos.run("cube_3d", ["--subdomains", number, "--cells", 4, *more])[1].iterations
+        for number, more in ((8, []), (64, []), (8, ["-tfeti_qp_type", "smalse"]))
+    )
+    assert many <= 1.2 * few
+    assert smalse >= 3 * few
+
+
 def test_versions_of_the_readme_are_those_that_run():
     major, minor, *_ = PETSC
     row = re.search(
@@ -112,8 +128,10 @@ def test_versions_of_the_readme_are_those_that_run():
 def test_the_sample_of_a_report_is_what_a_demo_prints(quick_demo, serial_only):
     """Lines and words alike; whole numbers within 5 %, as each gmsh has its own mesh."""
     (sample,) = re.findall(r"^```text\n(.*?)^```", page("docs/report"), re.DOTALL | re.MULTILINE)
-    said = sample.splitlines()
-    printed = quick_demo("cylinder_on_block_2d").out.splitlines()
+    said, printed = (
+        re.sub(r"\n {12}", " ", text).splitlines()
+        for text in (sample, quick_demo("cylinder_on_block_2d").out)
+    )
     start = printed.index(said[0])
     printed = printed[start : start + len(said)]
     number = re.compile(r"-?\d[\d.]*(e[-+]\d+)?")

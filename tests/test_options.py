@@ -113,6 +113,15 @@ def test_the_command_line_of_a_program(serial_only, tmp_path):
     )
     assert result.returncode == 0, result.stderr
     assert "TFETI solve CONVERGED_RTOL" in result.stdout
-    for name in ("mesh", "contact", "gluing", "assembly", "subdomains", "dual", "qp", "recovery"):
+    for name in (
+        "mesh",
+        "contact",
+        "constraints",
+        "assembly",
+        "factors",
+        "coarse",
+        "solve",
+        "recovery",
+    ):
         assert f"tfeti: {name}" in result.stdout
     assert "unused database" not in result.stdout + result.stderr

@@ -15,7 +15,7 @@ from scipy.sparse._base import _spbase
 import tfeti_dolfinx as tfeti
 
 COUNTERS = ("assemblies", "searches", "gluings", "factorizations", "coarse_factorizations")
-MADE_ONCE = {"stiffness", "search", "rows", "factors", "trace", "coarse problem"}
+MADE_ONCE = {"stiffness", "search", "constraints", "factors", "trace", "coarse problem"}
 
 
 class Repeated:

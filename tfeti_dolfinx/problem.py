@@ -153,7 +153,7 @@ class ContactProblem:
         self.report = Report(seconds=self._seconds)
         with stage("assembly", self._seconds):
             forms = self._forms(a, L, V, form_compiler_options, jit_options)
-        with stage("gluing", self._seconds):
+        with stage("constraints", self._seconds):
             self.dofs = TornDofs(V, decomposition)
             check_not_on_tears(self.bcs, self.dofs)
         forms.thickness = self._thickness
@@ -252,7 +252,7 @@ class ContactProblem:
                     new = system.search.take_in_overlapping(solution.u, overlap)
                 if new == 0:
                     return
-            system.change("rows")
+            system.change("constraints")
             self._counts.late_constraints += new
         raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
 
@@ -263,7 +263,7 @@ class ContactProblem:
         options = replace(system.options, rtol=self.options.rtol)
         dual.forget_counts()
         # 1. the multipliers
-        with stage("qp", seconds):
+        with stage("solve", seconds):
             start = None
             if self._start is not None:
                 dual.learn()

@@ -7,6 +7,7 @@ import resource
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from textwrap import TextWrapper
 from typing import Any, Self
 
 import numpy as np
@@ -271,6 +272,7 @@ class Outcome:
 # --- The report -------------------------------------------------------------------------------
 
 PRINTED = 10  # of a list; all of it is in the file
+WIDTH = 100  # of the printed lines
 SHOWN = ("displacement_error", "penetration", "balance")  # residuals of the short report
 # what adds up over solves, in ``in_all``
 COUNTERS = [f.name for kind in (SolverCounts, StageCounts) for f in fields(kind) if f.default == 0]
@@ -318,11 +320,14 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         ranks = f"{self.ranks} {'rank' if self.ranks == 1 else 'ranks'}"
         solves = int(self.in_all.get("solves", 0))
         steps = f", {self.newton_steps} Newton steps" if self.newton_steps else ""
+        done = f"{self.iterations} iterations"
+        if self.preconditioner_steps:
+            done += f", {self.preconditioner_steps} preconditioned"
         sets = f"{self.outer_iterations} outer and {self.cg_steps} CG steps"
         if self.active_sets:
             sets = f"{self.active_sets} active sets"
         most = sorted(self.seconds.items(), key=lambda item: -item[1])
-        stages = ", ".join(f"{k} {v:.2g}" for k, v in most if k != "total" and v >= 0.005)
+        stages = ", ".join(f"{k}\xa0{v:.2g}" for k, v in most if k != "total" and v >= 0.005)
         total = self.seconds.get("total", 0.0)
         rows = [
             (
@@ -335,11 +340,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
                 "accuracy",
                 ", ".join(self._measured(name) for name in SHOWN if name in self.residuals),
             ),
-            (
-                "solver",
-                f"{self.solver}: {self.iterations} iterations, "
-                f"{self.preconditioner_steps} preconditioned, {sets}{steps}",
-            ),
+            ("solver", f"{self.solver}: {done}, {sets}{steps}"),
             ("time", f"{total:.3g} s: {stages}; {self.peak_memory_mb:.0f} MB"),
             *(("note", text) for text in self.notes),
             *(("warning", text) for text in self.warnings),
@@ -349,7 +350,9 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         head = f"tfeti_dolfinx: {self.converged_reason}" + (
             f", solve {solves}" if solves > 1 else ""
         )
-        return "\n".join([head, *(f"  {name:<9} {text}" for name, text in rows if text)])
+        wrapped = TextWrapper(WIDTH, subsequent_indent=" " * 12, break_on_hyphens=False)
+        lines = [wrapped.fill(f"  {name:<9} {text}") for name, text in rows if text]
+        return "\n".join([head, *lines]).replace("\xa0", " ")
 
     def _measured(self, name: str) -> str:
         """Return a residual with its tolerance."""

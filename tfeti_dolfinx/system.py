@@ -259,7 +259,7 @@ class System:
         comm, new, old = self._dofs.comm, prescribe(self._dofs, self.bcs), self._prescribed
         self._prescribed = new
         if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
-            self.change("rows")
+            self.change("constraints")
         elif any_rank(comm, not np.array_equal(new.value, old.value)):
             self.change("right side")
         if self._search is not None and self._known_friction is not None:
@@ -271,7 +271,7 @@ class System:
         """Say that something has changed, a key of ``CHANGES``; what is out of date is freed."""
         self._stale |= set(CHANGES[what])
         if what == "stiffness" and not self.follows:
-            self._stale |= {"rows", "friction"}
+            self._stale |= {"constraints", "friction"}
         if "coarse problem" in self._stale:
             self._destroy_dual()
         if "factors" in self._stale:
@@ -353,7 +353,7 @@ class System:
             coarse_factorizations=done["coarse problem"] if has_kernel else 0,
             assemblies=done["stiffness"],
             searches=done["search"],
-            gluings=done["rows"],
+            gluings=done["constraints"],
             reused=[name for name in STAGES if name not in new],
         )
 
@@ -492,27 +492,27 @@ class System:
 STAGES: dict[str, tuple[str, Callable[[System], None]]] = {
     "stiffness": ("assembly", System._assemble_stiffness),
     "search": ("contact", System._find_contacts),
-    "rows": ("gluing", System._make_rows),
-    "right side": ("gluing", System._fill_right_side),
-    "friction": ("gluing", System._set_friction_limits),
+    "constraints": ("constraints", System._make_rows),
+    "right side": ("constraints", System._fill_right_side),
+    "friction": ("constraints", System._set_friction_limits),
     "load": ("assembly", System._assemble_load),
-    "factors": ("subdomains", System._factor),
+    "factors": ("factors", System._factor),
     "trace": (
-        "subdomains",
+        "factors",
         lambda system: system.subdomains.retrace(system.gluing.constraints.trace),
     ),
-    "coarse problem": ("dual", System._make_dual),
-    "linear term": ("dual", lambda system: system.dual.update_load()),
+    "coarse problem": ("coarse", System._make_dual),
+    "linear term": ("coarse", lambda system: system.dual.update_load()),
 }
 # what has to be made anew where something has changed
 CHANGES = {
     "points": tuple(STAGES),
     "stiffness": ("stiffness", "factors", "trace", "coarse problem"),  # and rows, by their scaling
-    "rows": ("rows", "friction", "trace", "coarse problem"),
-    "places": ("search", "rows", "friction", "trace", "coarse problem"),
+    "constraints": ("constraints", "friction", "trace", "coarse problem"),
+    "places": ("search", "constraints", "friction", "trace", "coarse problem"),
     "right side": ("right side", "linear term"),
     "friction": ("friction", "linear term"),
     "load": ("load", "linear term"),
 }
 # what comes with a stage
-BRINGS = {"rows": "right side", "factors": "trace", "coarse problem": "linear term"}
+BRINGS = {"constraints": "right side", "factors": "trace", "coarse problem": "linear term"}

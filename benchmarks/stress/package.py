@@ -158,7 +158,7 @@ def _reported(problem: tfeti.ContactProblem) -> dict[str, Any]:
         "warnings": report.warnings + report.notes,
         "F": report.iterations,
         "S": report.preconditioner_steps,
-        "qp": report.seconds.get("qp", 0.0),
+        "qp": report.seconds.get("solve", 0.0),
         "free_modes": report.free_modes,
         "rows": report.contact_constraints,
         "active": report.active_contacts,

@@ -124,7 +124,7 @@ def decomposed(
     pieces = graph.pieces(subdomain)
     of_piece, split, body = connected_parts(pieces, absorb=number > 0)
     if split and comm.rank == 0:
-        log.warning("subdomains that were not connected have been split: %s", split)
+        log.info("subdomains in several pieces have been split, which does no harm: %s", split)
     return replace(
         tear(untorn, of_piece[pieces.of_cell], comm), split=split, body_of_subdomain=body
     )

@@ -385,7 +385,7 @@ class ContactDynamics(ContactProblem):
         system = self._system
         system.make_up_to("right side", self._seconds)
         if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
-            system.change("rows")
+            system.change("constraints")
             system.make_up_to("right side", self._seconds)
         return predictor.nearest(free, self._forms_in_time.inertia.M, system.gluing)
 
