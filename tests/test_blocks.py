@@ -118,7 +118,7 @@ def test_what_is_wrong_with_stiffness_or_load_is_named(change, load, message):
     ("share", "message"),
     [
         (1e-3, "the stiffness is not positive semidefinite; expected a linear"),
-        (0.0, "the form gives no energy to 1 motion beside the 6 of a rigid body"),
+        (0.0, "the form gives no energy to 1 motion besides the 6 of a rigid body"),
     ],
 )
 def test_a_negative_energy_is_told_from_none(share, message):
@@ -155,7 +155,7 @@ def test_motions_without_energy_are_counted(cell, energy):
     assert free > 0
     count = f"{free} motion{'s' * (free > 1)}"
     with pytest.raises(
-        InputError, match=f"the form gives no energy to {count} beside the {rigid} of a rigid body"
+        InputError, match=f"the form gives no energy to {count} besides the {rigid} of a rigid body"
     ):
         block(K, x)
 

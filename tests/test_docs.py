@@ -1,6 +1,8 @@
 """Documents: every program and every command in them runs, and nothing they name is missing."""
 
+import ast
 import dataclasses
+import inspect
 import os
 import re
 import shlex
@@ -159,16 +161,49 @@ def test_every_block_of_a_user_page_is_run_or_has_a_reason():
             assert not [s for s in lines if s not in run and not s.startswith(tuple(NOT_RUN))], path
 
 
-def words(path):
-    """Of a page, but for tables that a benchmark or the code makes, and programs."""
+def prose(path):
+    """A page, but for tables that a benchmark or the code makes, and programs."""
     text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
-    return len(re.sub(r"<!-- .*?<!-- end -->", "", text, flags=re.DOTALL).split())
+    return re.sub(r"<!-- .*?<!-- end -->", "", text, flags=re.DOTALL)
+
+
+# what users read as constraints, iterations, active sets, expensive, instead of, compared with
+UNSAID = re.compile(
+    r"\b(multiplications?|rows?|faces?(?! (away|each|them|it)\b)|dear(er)?|prices?|scenes?|hats?"
+    r"|given bounds?|in the place of|beside|as ever|likewise|just if|right to)\b"
+)
+
+
+def strings_of(path):
+    """The texts of a module with a blank in them: messages, helps of options; no docstrings."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    apart = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+    found = [n for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str)]
+    return "\n".join(node.value for node in found if " " in node.value and id(node) not in apart)
+
+
+def public_docstrings(names):
+    """Docstrings of classes and functions, and of the members of the former."""
+    for thing in (getattr(tfeti, name) for name in names):
+        members = vars(thing).items() if inspect.isclass(thing) else ()
+        shown = [member for name, member in members if not name.startswith("_")]
+        yield from (inspect.getdoc(found) or "" for found in (thing, *shown))
+
+
+def test_what_users_read_has_their_words():
+    texts = [prose(path) for path in USER_PAGES]
+    core = (ROOT / "tfeti_dolfinx").rglob("*.py")
+    texts += [strings_of(path) for path in core if path.name != "testing.py"]
+    for_users = (ROOT / "docs/api.md").read_text().partition("## To extend")[0]
+    texts += public_docstrings(set(tfeti.__all__) & set(re.findall(r"auto\w+:: (\w+)", for_users)))
+    texts = [re.sub(r"`[^`]*`", "", text) for text in texts]
+    assert not [line for text in texts for line in text.splitlines() if UNSAID.search(line)]
 
 
 def test_user_pages_are_short():
-    assert sum(words(path) for path in USER_PAGES) <= 15000
+    assert sum(len(prose(path).split()) for path in USER_PAGES) <= 15000
     for path in (ROOT / "docs/howto").glob("*.md"):
-        assert words(path) <= 400, path.name
+        assert len(prose(path).split()) <= 400, path.name
 
 
 def anchors(path):

@@ -7,7 +7,7 @@ import dolfinx
 import numpy as np
 import pytest
 from petsc4py import PETSc
-from test_docs import ROOT, USER_PAGES
+from test_docs import ROOT, USER_PAGES, prose
 
 import demos
 import tfeti_dolfinx as tfeti
@@ -198,8 +198,7 @@ GIVEN = [
 @pytest.mark.parametrize("path", USER_PAGES, ids=lambda path: path.stem)
 def test_no_figure_of_a_user_page_is_without_a_source(path):
     """What neither a program, a table of a benchmark nor one of the patterns above gives."""
-    text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
-    text = re.sub(r"<!-- .*?<!-- end -->", "", text, flags=re.DOTALL)
+    text = prose(path)
     sources = [*OF_CODE_AND_TABLES, *(getattr(run, "values", run) for run in OF_RUNS)]
     for name, *rest in sources:
         if ROOT / f"{name}.md" == path:

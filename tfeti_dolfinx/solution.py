@@ -82,7 +82,7 @@ class Solution(ContactState):
         u: Displacement in primal order, shape ``(num_nodes * bs,)``.
         lam: Multipliers of this rank's constraints.
         boundary: What boundary elements know of it, if there are any: ``values_at``, which gives
-            rows as ``value_row``, and ``finite``, the cells of this rank without them.
+            values as ``value_row``, and ``finite``, the cells of this rank without them.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
         v: Velocity in DOLFINx's order of bodies with mass, else None.
@@ -258,8 +258,8 @@ class Solution(ContactState):
     def traction(self) -> fem.Function:
         """Contact traction on the surfaces of both sides, a vector; 0 elsewhere.
 
-        Its moments with the hats of degree 1 are those of the nodal contact forces, so action
-        and reaction of two sides have the same resultant.
+        Its moments with the shape functions of degree 1 are those of the nodal contact forces,
+        so action and reaction of two sides have the same resultant.
         """
         surfaces = [name for contact in self.contacts for name in contact.surfaces]
         values, area = vertex_tractions(self.nodal_forces, self.dofs, surfaces, self.thickness)

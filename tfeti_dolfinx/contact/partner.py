@@ -393,7 +393,7 @@ class Contact(ContactPartner):
         return settled, found
 
     def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
-        """One condition per node of ``a`` that faces ``b``. Collective.
+        """One condition per node of ``a`` opposite to ``b``. Collective.
 
         With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is
         n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i.

@@ -39,12 +39,12 @@ class FiniteJ2Plasticity(Plasticity):
     4. At the end of a load step C_p⁻¹ = F⁻¹ b_e F⁻ᵀ, ln b_e = 2(ε − 1.5 Δp s/q).
 
     P and its derivative are numbers at quadrature points. The residual has P + ∂P : (F − F̂), F̂
-    that of the last ``update``, beside the volumetric part κ/2 ln²J in UFL.
+    that of the last ``update``, and the volumetric part κ/2 ln²J in UFL.
 
     A tangent has to be definite on all that stretches, e = sym(δF F⁻¹), and stresses near the
     moduli, as a trial displacement may have, take e τ e from it. Where it keeps less than a share
     of the shear modulus it gets 2s e : e more, with the least s for that: the residual has
-    2s sym((F − F̂) F̂⁻¹) beside P, which is 0 at F̂.
+    2s sym((F − F̂) F̂⁻¹) added to P, which is 0 at F̂.
 
     ``NonlinearContactProblem(law.residual(v), u, ..., finite=True, state=law.state,
     update=law.update, stress=law.stress)`` takes it.

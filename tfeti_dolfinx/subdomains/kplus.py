@@ -107,10 +107,10 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
     if free:
         count = f"{'at least ' if free == TOLERANCES.counted else ''}{free} motion"
         return (
-            f"the form gives no energy to {count}{'s' * (free > 1)} beside the {rigid} of a rigid "
-            "body that it leaves free; expected a linear elastic form of the whole strain, with "
-            "quadrature that is fine enough (one point leaves hourglasses to quadrilaterals and "
-            "hexahedra)"
+            f"the form gives no energy to {count}{'s' * (free > 1)} besides the {rigid} of a "
+            "rigid body that it leaves free; expected a linear elastic form of the whole strain, "
+            "with quadrature that is fine enough (one point leaves hourglasses to quadrilaterals "
+            "and hexahedra)"
         )
     extents = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     return (
