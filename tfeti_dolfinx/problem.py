@@ -211,6 +211,11 @@ class ContactProblem:
             FactorError: A matrix could not be factored.
         """
         self._meet("solve")
+        self._solve()
+        return self.u
+
+    def _solve(self) -> None:
+        """Solve with the data that ranks have met with. Collective; it raises what solve does."""
         self._counts, self._outcome = SolverCounts(), Outcome()
         try:
             self._system.look_for_changes()
@@ -227,7 +232,6 @@ class ContactProblem:
         if self.options.view and self.decomposition.comm.rank == 0:
             options = self.options.view_text(self._settings.prefix)
             print(options, self.report.details(), sep="\n", flush=True)
-        return self.u
 
     def _solve_in_rounds(self) -> None:
         """Solve, with more and more contact rows, until no node without a row overlaps.
@@ -260,7 +264,7 @@ class ContactProblem:
         """Solve with the present rows, from the last solution on; return what may overlap, too."""
         system, seconds, d = self._system, self._seconds, self.decomposition
         dual, gluing = system.make(seconds), system.gluing
-        options = replace(system.options, rtol=self.options.rtol)
+        options = replace(system.options, rtol=self.options.rtol, warnings=self.options.warnings)
         dual.forget_counts()
         # 1. the multipliers
         with stage("solve", seconds):

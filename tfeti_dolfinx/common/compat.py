@@ -121,12 +121,14 @@ def first_component(V: fem.FunctionSpace) -> tuple[fem.FunctionSpace, Array]:
     return S, np.ravel(parent).astype(np.int64)
 
 
-def assemble_csr(form: fem.Form) -> Any:
+def assemble_csr(form: fem.Form, A: la.MatrixCSR | None = None) -> Any:
     """Return this rank's diagonal block of a bilinear form, as a scipy CSR matrix.
 
-    Needs a mesh whose vertices are never shared between ranks, so nothing is communicated.
+    Needs a mesh whose vertices are never shared between ranks, so nothing is communicated. It is
+    on the data of A, whose entries are those of the form; without it on new data.
     """
-    A = fem.create_matrix(form, la.BlockMode.expanded)
+    A = fem.create_matrix(form, la.BlockMode.expanded) if A is None else A
+    A.set_value(0.0)
     fem.assemble_matrix(A, form)
     return A.to_scipy()
 

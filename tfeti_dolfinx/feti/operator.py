@@ -11,9 +11,15 @@ from time import perf_counter
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array, joined, node_means
+from tfeti_dolfinx.common.arrays import (
+    Array,
+    entries_of_rows,
+    entries_within,
+    joined,
+    node_means,
+)
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
@@ -30,27 +36,29 @@ def near_stiffness(blocks: Sequence[SparseBlock], rigid: int = 0) -> tuple[csr_a
     unknowns of this rank, as ``Subdomains`` has them, and after them on the t_n ones next to them;
     and the mean of the diagonal of K at each node of these, shape ``(t_n,)``.
     """
-    parts, means = [], []
-    places: list[Array] = [np.empty(0, dtype=np.int64)]
+    means, values = list[Array](), list[Array]()
+    none: Array = np.empty(0, dtype=np.int64)
+    rows, columns = [none], [none]
     start, end = 0, rigid + sum(len(block.trace_dofs) for block in blocks)
     for block in (block for block in blocks if len(block.trace_dofs)):
         trace, bs, K = block.traced.trace, block.bs, block.stiffness.K
-        rows = K[trace]
-        rows.eliminate_zeros()  # entries between fixing nodes
-        nodes = np.unique(rows.indices // bs)
+        entries, _ = entries_of_rows(K, trace)
+        entries = entries[K.data[entries] != 0.0]  # those between fixing nodes may be 0
+        nodes = np.unique(K.indices[entries] // bs)
         reached = (bs * nodes[:, None] + np.arange(bs)).ravel()
         next_to = np.setdiff1d(reached, trace, assume_unique=True)
         kept = np.concatenate((trace, next_to))
-        parts.append(K[kept][:, kept])
+        place = np.append(
+            start + np.argsort(block.place[block.trace_dofs]), end + np.arange(len(next_to))
+        )
+        part = entries_within(K, kept, kept)
+        rows.append(np.repeat(place, np.diff(part.indptr)))
+        columns.append(place[part.indices])
+        values.append(part.data)
         means.append(node_means(block.stiffness.diagonal, bs)[next_to])
-        places += [start + np.argsort(block.place[block.trace_dofs]), end + np.arange(len(next_to))]
         start, end = start + len(trace), end + len(next_to)
-    if rigid:
-        parts.append(csr_array((rigid, rigid)))
-        places.append(start + np.arange(rigid))
-    order = np.argsort(np.concatenate(places))
-    K = csr_array(block_diag(parts, format="csr")) if parts else csr_array((0, 0))
-    return csr_array(K[order][:, order]), joined(means)
+    where = np.concatenate(rows), np.concatenate(columns)
+    return csr_array((joined(values), where), shape=(end, end)), joined(means)
 
 
 # --- The dual operator F = B K⁺ Bᵀ and its preconditioners ------------------------------------
@@ -206,9 +214,10 @@ def chosen_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
     Where a subdomain keeps its volume, or springs hold one, the lumped one takes many times as many
     steps; there, in tangents, in clusters, and beside other Blocks it is Dirichlet's.
     """
+    if subdomains.tangents:
+        return dirichlet_preconditioner(B, subdomains)
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     other = subdomains.num_clusters > 0 or len(sparse) < len(subdomains.elastic)
-    other = other or subdomains.tangents
     dear = any(block.stiffness.entries > CHOICE.dear * block.stiffness.size for block in sparse)
     held = any(block.kernel.shape[1] < block.modes.shape[1] for block in sparse)
     stiff = any(block.stiffness.stretch_over_shear > CHOICE.volume for block in sparse)

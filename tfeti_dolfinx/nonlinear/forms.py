@@ -9,12 +9,12 @@ from typing import Any, ClassVar
 import basix
 import numpy as np
 import ufl
-from dolfinx import fem
+from dolfinx import fem, la
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import assemble_csr, geometry_dofmap
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -32,6 +32,8 @@ class NewtonForms(Forms):
 
     Attributes:
         kept: Whether matrix and factors stay as they are, though u changes.
+        known: F(u) where it is known; else None.
+        at_model: F(u) of the last load.
     """
 
     names: ClassVar[tuple[str, str]] = ("J", "F")
@@ -40,9 +42,12 @@ class NewtonForms(Forms):
         self, J: ufl.Form, F: ufl.Form, *as_forms: Any, u: fem.Function, finite: bool
     ) -> None:
         self._u, self.kept = u, False
+        self.known: Array | None = None
+        self.at_model: Array = np.zeros(0)
         self._x = u.function_space.mesh.geometry.x
         self._reference = self._x.copy() if finite else None
         self._matrix: csr_array | None = None
+        self._entries: la.MatrixCSR | None = None
         super().__init__(J, F, *as_forms)
 
     def changes(self, *kept: str) -> set[str]:
@@ -51,16 +56,19 @@ class NewtonForms(Forms):
         return found | {"load"} if "stiffness" in found else found
 
     def stiffness(self) -> Any:
-        """Return this rank's J(u)."""
+        """Return this rank's J(u), on the data of the last one."""
+        if self._entries is None:
+            self._entries = fem.create_matrix(self._a, la.BlockMode.expanded)
         with self._in_place():
-            self._matrix = super().stiffness()
-        return self._matrix.copy()  # Blocks take their data from it
+            self._matrix = assemble_csr(self._a, self._entries)
+        return self._matrix
 
     def load(self) -> Array:
         """Return this rank's J u − F(u)."""
         assert self._matrix is not None  # stages make it before
         owned = self._matrix.shape[1]
-        return np.asarray(self._matrix @ self._u.x.array[:owned] - self.residual())
+        self.at_model = self.residual() if self.known is None else self.known
+        return np.asarray(self._matrix @ self._u.x.array[:owned] - self.at_model)
 
     def tangent_times(self, d: Array) -> Array:
         """Return this rank's J(u) d."""
@@ -114,7 +122,7 @@ class InertialNewtonForms(NewtonForms):
         J = super().stiffness()
         with self._in_place():
             self._matrix = self.inertia.stiffness(J)
-        return self._matrix.copy()
+        return self._matrix
 
     def tangent_times(self, d: Array) -> Array:
         """Return this rank's (J/2 + 2M/τ²) d."""

@@ -161,6 +161,7 @@ class NonlinearContactProblem(ContactProblem):
                 where the load step began.
             FactorError: A tangent stiffness could not be factored.
         """
+        self._meet("solve")
         begin, total = np.array(self.u.x.array), Totals()
         try:
             self._newton(total)
@@ -172,7 +173,8 @@ class NonlinearContactProblem(ContactProblem):
             self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:
-            self.options = replace(self.options, rtol=self._exact)
+            warns = self._settings.options.warnings
+            self.options = replace(self.options, rtol=self._exact, warnings=warns)
             self.report.take(total.entered(self.report))
         return self.u
 
@@ -188,7 +190,7 @@ class NonlinearContactProblem(ContactProblem):
             # 1. model
             rtol = float(np.clip(self._forcing * asked, tol.final * exact, self._loosest))
             try:
-                self._solve_linearised(rtol)
+                self._solve_linearised(rtol, warns=step == 0 or rtol <= exact)
             except OverlapError as error:  # that of an iterate, not of what was given
                 if step == 0:
                     raise
@@ -218,10 +220,11 @@ class NonlinearContactProblem(ContactProblem):
             if t < 1.0 or keeping.is_slow(size) or size > tol.other * keeping.before:
                 faster.forget()  # a model that does not hold along d tells nothing of the next
             plain = t < 1.0 or step == 0 or not (self._finite or forms.kept)
-            self._set(u + t * d if plain else faster.next(u, d))
-            if self._smallest_volume() <= 0.0:
-                faster.forget()
-                self._set(u + t * d)
+            if not plain:  # else the line search has ended there
+                self._set(faster.next(u, d))
+                if self._smallest_volume() <= 0.0:
+                    faster.forget()
+                    self._set(u + d)
             forms.kept = keeping.next(size, t, remainder)
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
@@ -269,17 +272,18 @@ class NonlinearContactProblem(ContactProblem):
                 "I + grad(u)"
             )
 
-    def _solve_linearised(self, rtol: float) -> None:
-        """Solve the contact problem of the model at u. Collective."""
-        self.options = replace(self.options, rtol=rtol)
-        if self._places is None:
-            super().solve()
-            return
-        self._go_to_places(self._places)
+    def _solve_linearised(self, rtol: float, warns: bool) -> None:
+        """Solve the contact problem of the model at u; the last one warns. Collective."""
+        warns &= self._settings.options.warnings
+        self.options = replace(self.options, rtol=rtol, warnings=warns)
+        if self._places is not None:
+            self._go_to_places(self._places)
         try:
-            super().solve()
+            self._solve()
         finally:
-            self._places.back()
+            self._newton_forms.known = None
+            if self._places is not None:
+                self._places.back()
 
     def _go_to_places(self, places: CurrentPlaces) -> None:
         """Let contact and rigid motions be those of X + u. Collective."""
@@ -291,7 +295,7 @@ class NonlinearContactProblem(ContactProblem):
 
     def _set(self, u: Array) -> None:
         """Take a displacement, and what depends on it. Collective."""
-        self.u.x.array[:] = u
+        self.u.x.array[:], self._newton_forms.known = u, None
         if self._update is not None:
             self._update()
 
@@ -300,18 +304,18 @@ class NonlinearContactProblem(ContactProblem):
         return 1.0 if self._places is None else self._places.smallest_volume_ratio()
 
     def _line_search(self, u: Array, d: Array) -> tuple[float, float]:
-        """Return the length t in (0, 1] of the step d from u, and |r(1)/r(0)|. Collective."""
-        tol = self._tolerances
+        """Go to u + t d, and return the length t in (0, 1] and |r(1)/r(0)|. Collective."""
+        tol, at_u = self._tolerances, self._newton_forms.at_model
         subdomains = self._system.subdomains
         primal = subdomains.with_rigid(self.dofs.to_primal(d))
         diagonal = sum(
             float(block.diagonal @ primal[part] ** 2)
             for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True)
         )
-        own = np.array([sum(subdomains.energies(primal)), diagonal])
-        energy, diagonal = self._total(own)
-        start, rounding = -float(energy), tol.rounding * float(diagonal)
-        forces = start - self._slope(u, d, 0.0)  # λᵀB d, since J d + F(u) + Bᵀλ = 0
+        own = [sum(subdomains.energies(primal)), diagonal, at_u @ d]
+        energy, diagonal, slope = map(float, self._total(np.array(own)))
+        start, rounding = -energy, tol.rounding * diagonal
+        forces = start - slope  # λᵀB d, since J d + F(u) + Bᵀλ = 0
         b, high = self._longest(u, d, forces)
         # of a step that is rigid, or nearly, slopes are rounding and say nothing
         remainder = abs(high / start) if abs(start) > rounding else 1.0
@@ -347,7 +351,8 @@ class NonlinearContactProblem(ContactProblem):
     def _slope(self, u: Array, d: Array, t: float) -> float:
         """F(u + t d; d). Collective."""
         self._set(u + t * d)
-        (slope,) = self._total(np.array([self._newton_forms.residual() @ d]))
+        self._newton_forms.known = F = self._newton_forms.residual()
+        (slope,) = self._total(np.array([F @ d]))
         return float(slope)
 
     def _total(self, own: Array) -> Array:
