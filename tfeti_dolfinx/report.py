@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from textwrap import TextWrapper
@@ -316,40 +316,39 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         return {name: getattr(self, name) for name in COUNTERS}
 
     def __str__(self) -> str:
-        bodies = f"{self.bodies} {'body' if self.bodies == 1 else 'bodies'}"
-        ranks = f"{self.ranks} {'rank' if self.ranks == 1 else 'ranks'}"
-        solves = int(self.in_all.get("solves", 0))
-        steps = f", {self.newton_steps} Newton steps" if self.newton_steps else ""
-        done = f"{self.iterations} iterations"
-        if self.preconditioner_steps:
-            done += f", {self.preconditioner_steps} preconditioned"
-        sets = f"{self.outer_iterations} outer and {self.cg_steps} CG steps"
-        if self.active_sets:
-            sets = f"{self.active_sets} active sets"
+        sizes = (
+            (self.primal_dofs, "unknowns"),
+            (self.bodies, "bodies"),
+            (self.subdomains, "subdomains"),
+            (self.ranks, "ranks"),
+        )
+        work = (
+            (self.iterations, "iterations"),
+            (self.preconditioner_steps, "preconditioned"),
+            (self.active_sets, "active sets"),
+            (0 if self.active_sets else self.outer_iterations, "outer steps"),
+            (0 if self.active_sets else self.cg_steps, "CG steps"),
+            (self.friction_newton_steps, "steps on Coulomb's law"),
+            (self.newton_steps, "Newton steps"),
+        )
+        solves, total = self.in_all.get("solves", 0), self.seconds.get("total", 0.0)
         most = sorted(self.seconds.items(), key=lambda item: -item[1])
-        stages = ", ".join(f"{k}\xa0{v:.2g}" for k, v in most if k != "total" and v >= 0.005)
-        total = self.seconds.get("total", 0.0)
+        stages = [f"{name}\xa0{s:.2g}" for name, s in most if name != "total" and s >= 0.005]
+        seconds = f": {', '.join(stages)}" * bool(stages)
+        accuracy = [self._measured(name) for name in SHOWN if name in self.residuals]
+        rest = len(self.contacts) - PRINTED
         rows = [
-            (
-                "model",
-                f"{self.primal_dofs} unknowns, {bodies}, {self.subdomains} subdomains, {ranks}",
-            ),
+            ("model", _counted(sizes)),
             *(("contact", str(contact)) for contact in self.contacts[:PRINTED]),
+            *[("contacts", f"and {rest} contacts more, see details()")] * (rest > 0),
             *(("tool", text) for text in self.tools),
-            (
-                "accuracy",
-                ", ".join(self._measured(name) for name in SHOWN if name in self.residuals),
-            ),
-            ("solver", f"{self.solver}: {done}, {sets}{steps}"),
-            ("time", f"{total:.3g} s: {stages}; {self.peak_memory_mb:.0f} MB"),
+            ("accuracy", ", ".join(accuracy)),
+            ("solver", f"{self.solver}: {_counted(work)}"),
+            ("time", f"{total:.3g} s{seconds}; {self.peak_memory_mb:.0f} MB"),
             *(("note", text) for text in self.notes),
             *(("warning", text) for text in self.warnings),
         ]
-        if (rest := len(self.contacts) - PRINTED) > 0:
-            rows.insert(1 + PRINTED, ("contacts", f"and {rest} contacts more, see details()"))
-        head = f"tfeti_dolfinx: {self.converged_reason}" + (
-            f", solve {solves}" if solves > 1 else ""
-        )
+        head = f"tfeti_dolfinx: {self.converged_reason}" + f", solve {solves}" * (solves > 1)
         wrapped = TextWrapper(WIDTH, subsequent_indent=" " * 12, break_on_hyphens=False)
         lines = [wrapped.fill(f"  {name:<9} {text}") for name, text in rows if text]
         return "\n".join([head, *lines]).replace("\xa0", " ")
@@ -364,13 +363,14 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         """Return all fields as text, one in a line."""
         lines = []
         for name, value in asdict(self).items():
-            if isinstance(value, dict) and value:
-                lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
-            elif isinstance(value, list) and value:
-                lines += [f"{name:<31} {_item(item)}" for item in value[:PRINTED]]
-                lines += [f"{name:<31} {len(value)} in all"]
+            if isinstance(value, dict):
+                items = [(f"{name}.{key}", f"{item:.6g}") for key, item in value.items()]
+            elif isinstance(value, list):
+                items = [(name, _item(item)) for item in value[:PRINTED]]
+                items += [(name, f"{len(value)} in all")] * bool(value)
             else:
-                lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
+                items = [(name, f"{value:.6g}" if isinstance(value, float) else str(value))]
+            lines += [f"{key:<40} {text}" for key, text in items or [(name, "-")]]
         return "\n".join(lines)
 
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
@@ -383,6 +383,16 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
             if comm.rank == 0:
                 with written_whole(Path(path)) as partial:
                     partial.write_text(json.dumps(asdict(self), indent=2) + "\n")
+
+
+def _counted(numbers: Sequence[tuple[int, str]]) -> str:
+    """Return numbers with what they count, in the plural; of those that are 0 the first alone."""
+    one = {"bodies": "body"}
+    return ", ".join(
+        f"{number} {one.get(name, name.removesuffix('s')) if number == 1 else name}"
+        for i, (number, name) in enumerate(numbers)
+        if number or i == 0
+    )
 
 
 def _item(item: str | list[float] | dict[str, Any]) -> str:
