@@ -77,8 +77,8 @@ def counted() -> Iterator[Counts]:
             return solve(problem, *given, **named)
         finally:
             report = problem.report
-            counts.F += report.iterations
-            counts.S += report.preconditioner_steps
+            counts.F += report.F_multiplications
+            counts.S += report.preconditioner_multiplications
             counts.reasons[report.converged_reason] += 1
             counts.u = float(problem.u.x.petsc_vec.norm())
 

@@ -244,7 +244,7 @@ def contact(made, qp_type, options):
     row = {
         "solver": f"contact, {qp_type}",
         "setting": f"rtol {problem.options.number:.0e}",
-        "steps": f"{report.iterations} F + {report.preconditioner_steps} S",
+        "steps": f"{report.F_multiplications} F + {report.preconditioner_multiplications} S",
         "set-up": seconds["factors"],
         "solve": seconds["coarse"] + seconds["solve"],
         "all": solve_seconds({"seconds": seconds}),

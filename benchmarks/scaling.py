@@ -84,8 +84,8 @@ def bandwidth(ranks):
 def costs(report):
     """Columns that all studies have."""
     return {
-        "F": report["iterations"],
-        "S": report["preconditioner_steps"],
+        "F": report["F_multiplications"],
+        "S": report["preconditioner_multiplications"],
         **stage_seconds(report),
         "without mesh": solve_seconds(report),
         "processor": report["processor"],

@@ -69,14 +69,14 @@ def row(reports, talk, subdomains, rtol):
         "dual, talk": dual,
         "kernel": newton.kernel_dim,
         "kernel, talk": kernel,
-        "F, Newton": newton.iterations,
-        "S, Newton": newton.preconditioner_steps,
-        "F, SMALSE": smalse.iterations,
+        "F, Newton": newton.F_multiplications,
+        "S, Newton": newton.preconditioner_multiplications,
+        "F, SMALSE": smalse.F_multiplications,
         "F, talk": multiplications,
         "outer, Newton": newton.outer_iterations,
         "outer, SMALSE": smalse.outer_iterations,
-        "power method": smalse.norm_steps,
-        **(rubbing(newton) if newton.tangential_constraints else {}),
+        "power method": smalse.power_method_multiplications,
+        **(rubbing(newton) if newton.tangential_rows else {}),
         **{f"seconds, {name}": seconds_of(report) for name, report in reports.items()},
         **({} if seconds is None else {"seconds, talk": seconds}),
     }
@@ -84,7 +84,7 @@ def row(reports, talk, subdomains, rtol):
 
 def rubbing(report):
     """Shares of the contact nodes that stick and that slide."""
-    touching = report.contact_constraints
+    touching = report.contact_rows
     return {"sticking": report.sticking / touching, "sliding": report.sliding / touching}
 
 

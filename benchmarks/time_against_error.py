@@ -280,7 +280,7 @@ def solved_row(case: Case, size: float, reference: Path) -> dict[str, Any]:
         "seconds": best.seconds,
         "meshing": best.meshing,
         "MB": best.peak,
-        "F": int(report.in_all["iterations"]),
+        "F": int(report.in_all["F_multiplications"]),
         "energy": energy_error(reference, problem.solution) if timed else None,
         "estimate": problem.estimate().relative_discretisation,
         "profile": profile(scene, problem.solution).tolist(),

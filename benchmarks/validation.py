@@ -71,13 +71,13 @@ class Row:
 def work(problem: tfeti.ContactProblem) -> int:
     """Multiplications of the last solve."""
     report = problem.report
-    return report.iterations + report.preconditioner_steps
+    return report.F_multiplications + report.preconditioner_multiplications
 
 
 def in_all(report: tfeti.Report) -> int:
     """Multiplications of all solves."""
     counted = report.in_all
-    return counted["iterations"] + counted["preconditioner_steps"]
+    return counted["F_multiplications"] + counted["preconditioner_multiplications"]
 
 
 # --- Meshes and forms -------------------------------------------------------------------------

@@ -197,7 +197,8 @@ if comm.rank == 0:
     for record, at, n, a, b in zip(records, d, N, plates, under_head, strict=True):
         print(
             f"pulled {at:.4f}: shear {a + b:5.0f}, plates {a / (mu * n):.3f} μN, "
-            f"head {b / (mu * n):.3f} μN, N {n:.0f}, {record.figures['iterations']} iterations"
+            f"head {b / (mu * n):.3f} μN, N {n:.0f}, "
+            f"{record.figures['F_multiplications']} iterations"
         )
 # -
 

@@ -128,7 +128,7 @@ if t[-1] > begins["second"] + touch:
     errors["period"] = np.sum(p) * size / (rho * g * L) / period - 1
 problem.report.errors.update({name: float(value) for name, value in errors.items()})
 if comm.rank == 0:
-    F = [record.figures["iterations"] for record in records]
+    F = [record.figures["F_multiplications"] for record in records]
     motion = [record.motion for record in records]
     lost = -sum(m["contact"] + m["predictor"] for m in motion) / max(m["energy"] for m in motion)
     print(f"{len(t)} steps of {size:.4g}, {sum(F)} iterations, at most {max(F)} in a step")

@@ -220,7 +220,7 @@ for share in 0.8 * np.arange(steps + 1) / steps:
     if comm.rank == 0:
         report = problem.report
         print(f"Q = {share:.2f} μP: c/a {c / a:.4f}, closed form {stick(share) / a:.4f};", end=" ")
-        print(f"{report.iterations} iterations", flush=True)
+        print(f"{report.F_multiplications} iterations", flush=True)
 problem.report.errors.update(errors)
 # -
 

@@ -177,7 +177,7 @@ if comm.rank == 0:
         done = record.figures
         print(
             f"depth {record.time:5.2f}: force {own:.1f}, {done['newton_steps']} tangents, "
-            f"{done['iterations']} iterations"
+            f"{done['F_multiplications']} iterations"
         )
     print(
         f"work {work:.0f} = friction {friction:.0f} + flow {flow:.0f} + elastic {kept:.0f} "

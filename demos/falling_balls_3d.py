@@ -165,7 +165,7 @@ if len(touching):
     errors["duration"] = float((last - start) * size / hertz_lasts - 1)
 problem.report.errors.update(errors)
 if comm.rank == 0:
-    F = [record.figures["iterations"] for record in records]
+    F = [record.figures["F_multiplications"] for record in records]
     motion = [record.motion for record in records]
     print(f"{len(records)} steps of {size:.4g}, {sum(F)} iterations")
     print(f"median {np.median(F):g}, at most {max(F)} in a step")

@@ -160,7 +160,9 @@ def impact(name, stabilised):
     }
     if comm.rank == 0:
         print(f"{name}, {'stabilised' if stabilised else 'plain'}, {len(t)} steps,", end=" ")
-        print(f"{sum(record.figures['iterations'] for record in records)} iterations:", end=" ")
+        print(
+            f"{sum(record.figures['F_multiplications'] for record in records)} iterations:", end=" "
+        )
         print(", ".join(f"{key} {value:.4g}" for key, value in errors.items()), flush=True)
     return problem, t / begins, p / closed, errors
 

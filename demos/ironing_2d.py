@@ -126,7 +126,7 @@ if comm.rank == 0:
         done = record.figures
         print(
             f"step {record.time:4.1f}: force down {-force[1]:.4f}, along {force[0]:.4f}, "
-            f"{done['newton_steps']} tangents, {done['iterations']} iterations"
+            f"{done['newton_steps']} tangents, {done['F_multiplications']} iterations"
         )
 # -
 

@@ -136,7 +136,7 @@ if comm.rank == 0:
         done = record.figures
         print(
             f"step {record.time:4.1f}: force down {-force[2]:.4f}, along {force[0]:.4f}, "
-            f"{done['newton_steps']} tangents, {done['iterations']} iterations"
+            f"{done['newton_steps']} tangents, {done['F_multiplications']} iterations"
         )
     print(f"along over down {ratio:.3f}, off balance {errors['balance']:.1e} of it")
 # -

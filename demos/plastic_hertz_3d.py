@@ -124,7 +124,7 @@ if comm.rank == 0:
         done = record.figures
         print(
             f"d/R = {depth / R:.5f}: force {force:.3e}, elastic {closed:.3e}, "
-            f"{done['newton_steps']} tangents, {done['iterations']} iterations"
+            f"{done['newton_steps']} tangents, {done['F_multiplications']} iterations"
         )
     print(f"imprint {imprint:.2e}, of a displacement {most:.2e}")
 # -

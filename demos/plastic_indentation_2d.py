@@ -125,7 +125,7 @@ if comm.rank == 0:
         done = record.figures
         print(
             f"depth {record.time:5.2f}: force a radian {force:.4g}, slip lines {closed:.4g}, "
-            f"{done['newton_steps']} tangents, {done['iterations']} iterations"
+            f"{done['newton_steps']} tangents, {done['F_multiplications']} iterations"
         )
 # -
 

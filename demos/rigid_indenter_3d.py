@@ -140,7 +140,7 @@ if comm.rank == 0:
     print("d / R, F by displacement, d / R by the force, F of a half space (Hertz)")
     for row in zip(d, force, way, half_space, strict=True):
         print("  {:.4f}  {:.6f}  {:.4f}  {:.6f}".format(*row))
-    counts = [sum(r.figures["iterations"] for r in run) for run in (records, loaded)]
+    counts = [sum(r.figures["F_multiplications"] for r in run) for run in (records, loaded)]
     print(f"iterations: {counts[0]} by displacement, {counts[1]} by force")
 # -
 

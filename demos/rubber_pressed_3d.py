@@ -121,7 +121,7 @@ if comm.rank == 0:
         done = record.figures
         print(
             f"d/R = {record.time / R:.3f}: force {force:.4f}, Hertz {closed:.4f}, "
-            f"{done['assemblies']} tangents, {done['iterations']} iterations"
+            f"{done['assemblies']} tangents, {done['F_multiplications']} iterations"
         )
 # -
 

@@ -229,7 +229,7 @@ for share in (*up, *down, *-down):
             "dissipation": dissipated / lost,
             "defect": (work - (now[2] - before[2]) - dissipated) / lost,
             "problems": problem.report.friction_iterations,
-            "F": problem.report.iterations,
+            "F": problem.report.F_multiplications,
         }
     )
     before, last = now, share

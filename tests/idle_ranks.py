@@ -79,7 +79,7 @@ def test_obstacle_with_late_rows(comm, shared_tmp, cell, degree, subdomains):
     assert some_rank_is_idle(p.decomposition)
     p.solve()
     alone.solve()
-    assert p.report.late_constraints > 0
+    assert p.report.late_contact_rows > 0
     assert 0 < p.report.factorizations <= subdomains  # none is made again
     assert relative(displacement(p)[1], displacement(alone)[1]) <= 1e-7
     everything_asked_for(p, shared_tmp, pictures=cell == "hexahedron")  # demos draw in 2D

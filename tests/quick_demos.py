@@ -84,7 +84,7 @@ def alone(name, folder):
 def multiplications(report):
     """Multiplications by F and by the preconditioner of all solves of a report."""
     counted = report["in_all"]
-    return counted["iterations"] + counted["preconditioner_steps"]
+    return counted["F_multiplications"] + counted["preconditioner_multiplications"]
 
 
 def main():

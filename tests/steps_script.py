@@ -135,6 +135,6 @@ if __name__ == "__main__":
     everywhere = {k: v for part in MPI.COMM_WORLD.allgather(fields) for k, v in part.items()}
     if MPI.COMM_WORLD.rank == 0:
         figures = np.array([[r.time, r.size, r.dissipation, *r.tools.values()] for r in records])
-        F = np.array([r.figures["iterations"] for r in records])
-        late = np.array([r.figures["late_constraints"] for r in records])
+        F = np.array([r.figures["F_multiplications"] for r in records])
+        late = np.array([r.figures["late_contact_rows"] for r in records])
         np.savez(folder / "found.npz", x=x, u=u, figures=figures, F=F, late=late, **everywhere)

@@ -157,7 +157,7 @@ def test_the_gap_of_an_obstacle_is_what_is_given():
         p.solve()
         records, x = p.solution.gluing.records, p.solution.contact().points
         assert np.allclose(records.gap, 0.1 * x[:, 0] if expected is None else expected)
-        assert p.report.contact_constraints > 0
+        assert p.report.contact_rows > 0
     with pytest.raises(tfeti.InputError, match="obstacle of surface 'bottom': gap=nan, expected"):
         problem(d, contacts=[tfeti.Obstacle("bottom", plane, gap=np.nan)]).solve()
 

@@ -109,7 +109,7 @@ def test_iterations_are_as_pages_say(serial_only):
         assert words in page(name)
     assert "`smalse` takes several times as many iterations" in page("docs/guide/speed")
     few, many, smalse = (
-        demos.run("cube_3d", ["--subdomains", number, "--cells", 4, *more])[1].iterations
+        demos.run("cube_3d", ["--subdomains", number, "--cells", 4, *more])[1].F_multiplications
         for number, more in ((8, []), (64, []), (8, ["-tfeti_qp_type", "smalse"]))
     )
     assert many <= 1.2 * few

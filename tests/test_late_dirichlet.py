@@ -32,7 +32,7 @@ def solved(*given, **options):
     report, u = p.report, p.solution.u
     p.destroy()
     factors = report.factorizations // SUBDOMAINS
-    return report.solver, factors, report.preconditioner_steps, u
+    return report.solver, factors, report.preconditioner_multiplications, u
 
 
 def apart(u, other):
@@ -70,12 +70,12 @@ def test_more_solves_make_S_as_soon_as_they_multiply_by_it(late):
     scene = Repeated(local_type="implicit")
     scene.solve()
     report = scene.problem.report
-    count, first = report.factorizations, report.preconditioner_steps
+    count, first = report.factorizations, report.preconditioner_multiplications
     scene.solve()
     assert scene.problem.report.factorizations == 0
     scene.solve(load=-0.08)
     assert scene.problem.report.factorizations == count
-    assert 0 < scene.problem.report.preconditioner_steps < first
+    assert 0 < scene.problem.report.preconditioner_multiplications < first
     assert apart(scene.problem.solution.u, scene.fresh(load=-0.08).u) <= 1e-8
     scene.problem.destroy()
 

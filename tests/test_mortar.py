@@ -129,9 +129,9 @@ def test_pairs_out_of_reach_join_when_they_overlap():
     )
     near.solve()
     late.solve()
-    assert near.report.late_constraints == 0
-    assert late.report.late_constraints > 0
-    assert late.report.contact_constraints <= near.report.contact_constraints
+    assert near.report.late_contact_rows == 0
+    assert late.report.late_contact_rows > 0
+    assert late.report.contact_rows <= near.report.contact_rows
     assert relative(displacement(late)[1], displacement(near)[1]) <= 1e-7
     assert late.report.factorizations == near.report.factorizations
 
@@ -142,7 +142,7 @@ def test_a_body_that_only_far_surfaces_hold_is_found():
         d, pressed(d), held(d, "lower bottom", "lower left", "upper left"), [PAIR], rtol=1e-10
     )
     problem.solve()
-    assert problem.report.late_constraints == problem.report.contact_constraints == 5
+    assert problem.report.late_contact_rows == problem.report.contact_rows == 5
     assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, atol=1e-6)
 
 
@@ -186,7 +186,7 @@ def test_obstacle_under_a_uniform_pressure(cell, degree):
     problem = two_body_problem(d, pressed(d), held(d, *sides), [plane], degree, **TO_ROUNDING)
     problem.solve()
     assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, rtol=0, atol=1e-9)
-    assert problem.report.contact_constraints == 4 ** (gdim - 1)
+    assert problem.report.contact_rows == 4 ** (gdim - 1)
 
 
 @pytest.mark.parametrize(

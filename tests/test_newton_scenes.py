@@ -79,9 +79,9 @@ def test_it_finds_what_smalse_finds(name):
     smalse = solved(SCENES[name], tfeti_qp_type="smalse")
     assert apart(newton, smalse) <= 100 * RTOL
     assert newton.report.active_contacts > 0
-    assert newton.report.active_sets > 0 == smalse.report.active_sets
-    assert newton.report.norm_steps == 0
-    assert newton.report.iterations < smalse.report.iterations
+    assert newton.report.newton_faces > 0 == smalse.report.newton_faces
+    assert newton.report.power_method_multiplications == 0
+    assert newton.report.F_multiplications < smalse.report.F_multiplications
     newton.destroy()
     smalse.destroy()
 
@@ -92,7 +92,7 @@ def test_preconditioners_do_not_change_the_answer(pc_type):
     p = solved(scene, tfeti_qp_type="newton", tfeti_pc_type=pc_type)
     q = solved(scene, tfeti_qp_type="newton")
     assert apart(p, q) <= 100 * RTOL
-    multiplied = p.report.preconditioner_steps
+    multiplied = p.report.preconditioner_multiplications
     assert (multiplied == 0) == (pc_type == "none")
     p.destroy()
     q.destroy()
@@ -104,7 +104,7 @@ def test_a_second_solve_costs_next_to_nothing(name):
     p = solved(SCENES[name], tfeti_qp_type="newton")
     before = displacement(p)[1]
     p.solve()
-    assert p.report.iterations <= 2
+    assert p.report.F_multiplications <= 2
     assert p.report.factorizations == p.report.coarse_factorizations == 0
     assert np.allclose(displacement(p)[1], before, rtol=0, atol=100 * RTOL * np.abs(before).max())
     p.destroy()

@@ -99,7 +99,7 @@ def test_solvers_send_no_pickled_messages(pickled, qp_type, friction):
     pressed = tfeti.Obstacle("bottom", curved_obstacle(2), friction=friction)
     p = problem(decomposed("quadrilateral", 6, 4), contacts=[pressed], qp_type=qp_type)
     p.solve()
-    assert p.report.iterations > 5
+    assert p.report.F_multiplications > 5
     assert pickled == []
 
 
@@ -107,7 +107,7 @@ def test_clusters_send_no_pickled_messages(pickled):
     pressed = tfeti.Obstacle("bottom", curved_obstacle(3))
     p = problem(decomposed("hexahedron", 4, 8), contacts=[pressed], clusters=4)
     p.solve()
-    assert p.report.iterations > 5
+    assert p.report.F_multiplications > 5
     assert pickled == []
 
 

@@ -54,7 +54,7 @@ def steps(seed, turned):
                 raise
             break  # 1e-10 may be below rounding, with flat cells
         report = p.report
-        counts = report.iterations, report.preconditioner_steps
+        counts = report.F_multiplications, report.preconditioner_multiplications
         found.append((p.u.x.array.reshape(-1, gdim) @ Q, np.array(counts)))
         p.accept()
     p.destroy()

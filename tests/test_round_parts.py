@@ -193,7 +193,7 @@ def test_parts_of_a_graded_mesh_cost_what_those_of_others_do():
     plane = tfeti.Obstacle("low", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)))
     problem = tfeti.ContactProblem(a, ufl.ZeroBaseForm((v,)), bcs, [plane], cut)
     problem.solve()
-    assert problem.report.iterations < 25
+    assert problem.report.F_multiplications < 25
 
 
 def test_bodies_keep_their_parts():

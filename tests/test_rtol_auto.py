@@ -13,7 +13,7 @@ def work(p):
     """Multiplications by F and S, and what as much is done for looks."""
     r = p.report
     looks = r.recoveries + r.estimates.get("lifting_steps", 0)
-    return r.iterations + r.preconditioner_steps + looks
+    return r.F_multiplications + r.preconditioner_multiplications + looks
 
 
 def is_reached(p):
@@ -33,7 +33,7 @@ def test_it_saves_a_third_and_spoils_nothing(serial_only, scene, sizes, finest):
         exact.solve()
         assert is_reached(auto)
         assert error_against(auto, reference)[0] <= 1.01 * error_against(exact, reference)[0]
-        assert auto.report.iterations <= exact.report.iterations * 2 / 3
+        assert auto.report.F_multiplications <= exact.report.F_multiplications * 2 / 3
         assert work(auto) <= work(exact) * 2 / 3
 
 
@@ -61,7 +61,7 @@ def test_all_solvers_reach_it(cell, qp_type, law):
     for rtol in ("auto", 1e-8):
         p = problem(d, force, [obstacle], qp_type=qp_type, rtol=rtol)
         p.solve()
-        costs.append(p.report.iterations)
+        costs.append(p.report.F_multiplications)
         assert bool(p.report.estimates) == (rtol == "auto")
         if rtol == "auto":
             assert is_reached(p)
@@ -80,7 +80,7 @@ def test_without_contact_too():
     assert p.report.converged_reason == "CONVERGED_RTOL"
     exact = problem(decomposed("tetrahedron", 5, 8), rtol=1e-8)
     exact.solve()
-    assert p.report.iterations <= exact.report.iterations * 2 / 3
+    assert p.report.F_multiplications <= exact.report.F_multiplications * 2 / 3
 
 
 def test_where_the_mesh_makes_no_error_it_ends():

@@ -29,7 +29,7 @@ def multiplications(stiffness, **options):
     """Those by F, and how many motions were soft."""
     p = foundation(stiffness, **options)
     p.solve()
-    counted, soft = p.report.iterations, p.report.soft_modes
+    counted, soft = p.report.F_multiplications, p.report.soft_modes
     p.destroy()
     return counted, soft
 

@@ -44,8 +44,8 @@ def test_rows_out_of_reach_are_taken_in_before_a_body_is_called_free():
     floor = tfeti.Obstacle("bottom", slope, reach=0.0105)
     p = problem(d, (0.0, -0.05), [floor], clamped=())
     p.solve()
-    assert p.report.late_constraints == 8
-    assert p.report.contact_constraints == 9
+    assert p.report.late_contact_rows == 8
+    assert p.report.contact_rows == 9
     force = d.comm.allreduce(p.solution.contact(0).force.sum())
     assert force == pytest.approx(0.05, rel=1e-4)
 

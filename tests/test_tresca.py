@@ -117,7 +117,7 @@ def test_some_nodes_stick_and_some_slip():
     p, status = on_the_plane("hexahedron", 4, 4, (0.0, -0.035, -0.05), (0.015,))
     assert p.report.sticking == np.sum(status == tfeti.ContactStatus.STICK) > 0
     assert p.report.sliding == np.sum(status == tfeti.ContactStatus.SLIP) > 0
-    assert p.report.tangential_constraints == 2 * p.report.contact_constraints
+    assert p.report.tangential_rows == 2 * p.report.contact_rows
 
 
 def two_boxes(

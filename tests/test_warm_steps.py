@@ -36,7 +36,7 @@ def multiplications(scene, cold=False, **options):
         problem.solve()
         problem.accept()
         if any(np.linalg.norm(force) > 0.0 for force in problem.report.contact_forces):
-            counts.append(problem.report.iterations)
+            counts.append(problem.report.F_multiplications)
     problem.destroy()
     assert len(counts) >= 10
     return np.mean(counts)

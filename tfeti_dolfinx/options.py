@@ -97,7 +97,7 @@ class Options:
         "each, or by one factor or matrix for all that are equal; auto counts operations",
         choices=LOCAL_TYPES,
     )
-    local_iterations: int = described(
+    local_multiplications: int = described(
         50, "subdomains", "iterations to expect, for that count", fits=FROM_0
     )
     clusters: int = described(

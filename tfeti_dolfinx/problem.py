@@ -257,7 +257,7 @@ class ContactProblem:
                 if new == 0:
                     return
             system.change("constraints")
-            self._counts.late_constraints += new
+            self._counts.late_contact_rows += new
         raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
 
     def _solve_rows(self) -> tuple[Solution, float]:

@@ -39,12 +39,12 @@ class Sizes:
     subdomains: int = 0
     bodies: int = 0
     split_subdomains: int = 0  # that were not connected and were split
-    contact_constraints: int = 0  # of non-penetration
+    contact_rows: int = 0  # of non-penetration
     contact_candidates: int = 0  # nodes of the (secondary) contact surfaces
     far_contact_nodes: int = 0  # those that were out of reach or not covered, and have no row
     unmet_contacts: list[str] = field(default_factory=list)  # none of whose nodes has a row
-    dropped_constraints: int = 0  # that prescribed components decide alone
-    tangential_constraints: int = 0  # of contacts that have friction
+    dropped_contact_rows: int = 0  # that prescribed components decide alone
+    tangential_rows: int = 0  # of contacts that have friction
 
     @classmethod
     def of_rows(cls, gluing: Gluing, inside: int, unmet: list[str]) -> Self:
@@ -67,12 +67,12 @@ class Sizes:
             subdomains=decomposition.num_subdomains,
             bodies=decomposition.num_bodies,
             split_subdomains=len(decomposition.split),
-            contact_constraints=normals,
+            contact_rows=normals,
             contact_candidates=candidates,
             far_contact_nodes=far,
             unmet_contacts=unmet,
-            dropped_constraints=dropped,
-            tangential_constraints=tangents,
+            dropped_contact_rows=dropped,
+            tangential_rows=tangents,
         )
 
 
@@ -92,19 +92,19 @@ class StageCounts:
 class SolverCounts:
     """Counts of a solver, which add up over solves with more and more contact rows."""
 
-    late_constraints: int = 0  # of nodes out of reach that overlapped after a solve
-    iterations: int = 0  # all but the power method's
-    preconditioner_steps: int = 0
-    norm_steps: int = 0  # that estimated ‖PFP‖
+    late_contact_rows: int = 0  # of nodes out of reach that overlapped after a solve
+    F_multiplications: int = 0  # all but the power method's
+    preconditioner_multiplications: int = 0
+    power_method_multiplications: int = 0  # that estimated ‖PFP‖
     recoveries: int = 0  # displacements recovered to see how right they are, each one more solve
     friction_iterations: int = 0  # problems with given bounds of Coulomb's friction
     friction_newton_steps: int = 0  # of Newton's method on Coulomb's law, beside these problems
     outer_iterations: int = 0
-    active_sets: int = 0  # that block Newton has solved on
+    newton_faces: int = 0  # that block Newton has solved on
     cg_steps: int = 0
     expansion_steps: int = 0
     proportioning_steps: int = 0
-    active_set_factorizations: int = 0  # of G_f G_fᵀ, f a face of the rows
+    face_factorizations: int = 0  # of G_f G_fᵀ, f a face of the rows
     soft_factorizations: int = 0  # of soft motions, or of whole clusters, one for a face
 
     @classmethod
@@ -114,18 +114,20 @@ class SolverCounts:
         """Return the counts of a solver's run."""
         preconditioner, soft, steps = dual.preconditioner, dual.soft, result.steps
         return cls(
-            iterations=dual.F.count["solver"],
-            preconditioner_steps=(0 if preconditioner is None else preconditioner.count["solver"]),
-            norm_steps=dual.F.count["power method"],
+            F_multiplications=dual.F.count["solver"],
+            preconditioner_multiplications=(
+                0 if preconditioner is None else preconditioner.count["solver"]
+            ),
+            power_method_multiplications=dual.F.count["power method"],
             recoveries=accuracy.looks,
             friction_iterations=settling.iterations,
             friction_newton_steps=settling.newton_steps,
             outer_iterations=steps.outer,
-            active_sets=steps.faces,
+            newton_faces=steps.faces,
             cg_steps=steps.cg,
             expansion_steps=steps.expansion,
             proportioning_steps=steps.proportioning,
-            active_set_factorizations=dual.coarse.factors.count["face"],
+            face_factorizations=dual.coarse.factors.count["face"],
             soft_factorizations=0 if soft is None else soft.factors.count["face"],
         )
 
@@ -323,11 +325,11 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
             (self.ranks, "ranks"),
         )
         work = (
-            (self.iterations, "iterations"),
-            (self.preconditioner_steps, "preconditioned"),
-            (self.active_sets, "active sets"),
-            (0 if self.active_sets else self.outer_iterations, "outer steps"),
-            (0 if self.active_sets else self.cg_steps, "CG steps"),
+            (self.F_multiplications, "iterations"),
+            (self.preconditioner_multiplications, "preconditioned"),
+            (self.newton_faces, "active sets"),
+            (0 if self.newton_faces else self.outer_iterations, "outer steps"),
+            (0 if self.newton_faces else self.cg_steps, "CG steps"),
             (self.friction_newton_steps, "steps on Coulomb's law"),
             (self.newton_steps, "Newton steps"),
         )

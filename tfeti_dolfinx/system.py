@@ -92,7 +92,7 @@ class Settings:
         stiffness or load do not fit; a FactorError where a factor could not be made.
         """
         own, options, decomposition = self.extensions, self.options, dofs.decomposition
-        choice = LocalChoice(options.local_type, options.local_iterations)
+        choice = LocalChoice(options.local_type, options.local_multiplications)
         how = self.inverses(counters)
         found = (equals or EqualSubdomains(how)) if choice.type in ("auto", "shared") else None
         make = own.block or (lambda item: SparseBlock(item, how, found))

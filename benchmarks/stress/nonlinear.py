@@ -452,7 +452,7 @@ def _solved(scene: Scene, row: dict[str, Any]) -> str:
             advance(middle, end, halvings + 1)
             return
         problem.accept()
-        row["F"] += problem.report.iterations
+        row["F"] += problem.report.F_multiplications
         row["newton"] += problem.report.newton_steps
         tool, force = np.zeros(scene.gdim), None
         if scene.kind in ("tool", "force"):

@@ -318,7 +318,7 @@ class LoadSteps:
                 table: list[list[Any]] = [["time", *forces, *tools, *last]]
                 for r in self.records:
                     values = [*chain(*r.contact_forces), *(r.tools[name] for name in tools)]
-                    count = r.figures["iterations"]
+                    count = r.figures["F_multiplications"]
                     table.append([r.time, *values, r.dissipation, count, r.seconds])
                 with (
                     written_whole(target) as partial,
@@ -358,7 +358,7 @@ class LoadSteps:
                 log.info(
                     "load step %d of %d, t = %.6g: %d iterations, %.2g s",
                     *(place.number + 1, len(times) - 1, t),
-                    *(figures["iterations"], self.records[-1].seconds),
+                    *(figures["F_multiplications"], self.records[-1].seconds),
                 )
             place = place.ahead()
             self._keep(place, t)
