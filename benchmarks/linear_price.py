@@ -25,13 +25,14 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import tfeti_dolfinx as tfeti
-from benchmarks.stages import DEMOS, LARGE, MIDDLE, sizes, words_of
+from benchmarks import stages
 from benchmarks.tools import (
     choose_clock,
     command_line,
     configure_clock,
     finish,
     picture,
+    say,
     solve_seconds,
     stacked,
 )
@@ -83,11 +84,6 @@ class Linear:
         own = np.abs(x.array_r - self.reference).max(initial=0.0)
         return float(self.A.getComm().tompi4py().allreduce(own, op=MPI.MAX) / self.scale)
 
-    def destroy(self):
-        """Destroy the PETSc objects. Collective."""
-        self.A.destroy()
-        self.b.destroy()
-
 
 def linear_problem(made, solution):
     """The linear problem of a scene whose contact has been solved. Collective."""
@@ -102,8 +98,7 @@ def linear_problem(made, solution):
     load = dofs.to_primal(f).reshape(-1, dofs.bs)
     b.array[:] = dofs.reduce(load, np.add).ravel()
     u = dofs.reduce(solution.u.reshape(-1, dofs.bs), np.maximum)
-    prescribed = solution.gluing.prescribed
-    held = prescribed.flag.copy()
+    held = solution.gluing.prescribed.flag.copy()
     held[solution.gluing.records.group[solution.force > 0.0]] = True
     x = b.duplicate()
     x.array[:] = np.where(held, u, 0.0).ravel()
@@ -117,25 +112,25 @@ def linear_problem(made, solution):
 
 def untorn(K, dofs):
     """The stiffness of the untorn mesh: entries of torn copies added. Collective."""
+
+    def parallel(local, csr):
+        sizes = tuple((size, None) for size in local)
+        return PETSc.Mat().createAIJ(sizes, bsize=dofs.bs, csr=csr, comm=dofs.comm)
+
     group = np.empty(dofs.num_nodes, dtype=PETSc.IntType)
     group[dofs.dolfinx_node] = dofs.group
     index = (group[:, None] * dofs.bs + np.arange(dofs.bs, dtype=PETSc.IntType)).ravel()
     n, g = dofs.num_nodes * dofs.bs, dofs.num_groups * dofs.bs
     rows = np.arange(n + 1, dtype=PETSc.IntType)
-    copies = parallel_matrix(dofs, (n, g), (rows, index, np.ones(n)))
+    copies = parallel((n, g), (rows, index, np.ones(n)))
     columns = (K.indices + dofs.offsets[dofs.comm.rank] * dofs.bs).astype(PETSc.IntType)
-    torn = parallel_matrix(dofs, (n, n), (K.indptr.astype(PETSc.IntType), columns, K.data))
+    torn = parallel((n, n), (K.indptr.astype(PETSc.IntType), columns, K.data))
     A = torn.ptap(copies)
     torn.destroy()
     copies.destroy()
     A.setOption(PETSc.Mat.Option.SPD, True)
     A.setNearNullSpace(rigid_motions(A, dofs))
     return A
-
-
-def parallel_matrix(dofs, local_sizes, csr):
-    sizes = tuple((size, None) for size in local_sizes)
-    return PETSc.Mat().createAIJ(sizes, bsize=dofs.bs, csr=csr, comm=dofs.comm)
 
 
 def rigid_motions(A, dofs):
@@ -147,25 +142,24 @@ def rigid_motions(A, dofs):
     return PETSc.NullSpace().createRigidBody(points)
 
 
-def solve(linear, text, rtol):
-    """Set up and solve with the settings of a text; what came of it. Collective."""
+def linear_row(linear, kind, setting, rtol):
+    """Set up and solve the linear problem; a row. Collective."""
     comm, x = linear.A.getComm().tompi4py(), linear.b.duplicate()
-    with solver(text, rtol) as ksp:
+    with solver(SETTINGS[kind][setting], rtol) as ksp:
         ksp.setOperators(linear.A)
         comm.barrier()
         start = time.perf_counter()
         ksp.setUp()
         ready = time.perf_counter()
         ksp.solve(linear.b, x)
-        end = time.perf_counter()
-        found = {
-            "iterations": ksp.getIterationNumber(),
-            "set-up": comm.allreduce(ready - start, op=MPI.MAX),
-            "solve": comm.allreduce(end - ready, op=MPI.MAX),
-            "error": linear.error(x),
-        }
+        parts = ready - start, time.perf_counter() - ready
+        steps = ksp.getIterationNumber()
+    row = {"solver": kind, "setting": f"{setting}, rtol {rtol:.0e}", "steps": steps}
+    row["set-up"], row["solve"] = (comm.allreduce(part, op=MPI.MAX) for part in parts)
+    row |= {"all": linear.seconds + price(row), "error": linear.error(x)}
     x.destroy()
-    return found
+    say(row)
+    return row
 
 
 def first_tolerance(linear, text, rtol):
@@ -222,12 +216,19 @@ def available(kind, setting, comm):
 # --- Contact beside it ---------------------------------------------------------------------------
 
 OTHERS = [kind for kind in SETTINGS if kind != "GAMG"]
-SIZES = sizes(MIDDLE, LARGE)
+SCENES = {
+    "cube_3d": stages.DEMOS["cube_3d"],
+    "hertz_3d": {
+        "quick": stages.DEMOS["hertz_3d"]["quick"],
+        "default": stages.DEMOS["hertz_3d"]["large"],
+        "large": ["--unknowns", 2_090_000, "--subdomains", 256],
+    },
+}
 
 
 def configure(parser):
     parser.add_argument("--large", action="store_true", help="2 million unknowns, no direct solver")
-    parser.add_argument("--scenes", nargs="+", choices=list(DEMOS), default=list(DEMOS))
+    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--others", nargs="*", choices=OTHERS, default=OTHERS, help="than GAMG")
     configure_clock(parser)
@@ -240,78 +241,44 @@ def contact(made, qp_type, options):
     problem = tfeti.ContactProblem(**made, petsc_options={**options, **types})
     problem.solve()
     report = problem.report
-    seconds = report.seconds
     row = {
         "solver": f"contact, {qp_type}",
         "setting": f"rtol {problem.options.number:.0e}",
         "steps": f"{report.F_multiplications} F + {report.preconditioner_multiplications} S",
-        "set-up": seconds["factors"],
-        "solve": seconds["coarse"] + seconds["solve"],
-        "all": solve_seconds({"seconds": seconds}),
+        "set-up": report.seconds["factors"],
+        "solve": report.seconds["coarse"] + report.seconds["solve"],
+        "all": solve_seconds({"seconds": report.seconds}),
         "error": report.residuals["displacement_error"],
     }
     say(row)
     return problem, row
 
 
-def linear_row(linear, kind, setting, rtol):
-    """Solve the linear problem; a row."""
-    found = solve(linear, SETTINGS[kind][setting], rtol)
-    row = {
-        "solver": kind,
-        "setting": f"{setting}, rtol {rtol:.0e}",
-        "steps": found["iterations"],
-        "set-up": found["set-up"],
-        "solve": found["solve"],
-        "all": linear.seconds + found["set-up"] + found["solve"],
-        "error": found["error"],
-    }
-    say(row)
-    return row
-
-
-def say(row):
-    """Print a row at once: large scenes take their time."""
-    if MPI.COMM_WORLD.rank == 0:
-        print(*(f"{value:.4g}" if isinstance(value, float) else value for value in row.values()))
-        sys.stdout.flush()
-
-
-def study(demo, size, options, repeats, arguments):
+def study(made, options, repeats, arguments):
     """A row for each solver and setting, the fastest of several runs that take turns."""
-    made = scene(demo, words_of(size))
-    rtol = float(options.get("tfeti_rtol", DEFAULT_RTOL))
+    rtol, found = float(options.get("tfeti_rtol", DEFAULT_RTOL)), []
     problem, row = contact(made, "newton", options)
     linear = linear_problem(made, problem.solution)
     problem.destroy()
-    rows = [[row]]
-    work = tried(linear, rtol, arguments)
-    for repeat in range(repeats):
-        for i, (kind, setting, tolerance) in enumerate(work):
-            if repeat == 0:
-                rows.append([])
-            rows[i + 1].append(linear_row(linear, kind, setting, tolerance))
-        if repeat + 1 < repeats:
-            problem, row = contact(made, "newton", options)
-            problem.destroy()
-            rows[0].append(row)
-    linear.destroy()
-    if not arguments.no_smalse:  # once: it takes its time
-        problem, row = contact(made, "smalse", options)
-        problem.destroy()
-        rows.insert(1, [row])
-    return [min(found, key=price) for found in rows], problem.report
-
-
-def tried(linear, rtol, arguments):
-    """Kind, setting and tolerance of the linear solvers that PETSc has."""
-    comm = linear.A.getComm().tompi4py()
-    return [
+    work = [
         (kind, setting, first_tolerance(linear, text, rtol))
         for kind in ("GAMG", *arguments.others)
         for setting, text in SETTINGS[kind].items()
-        if available(kind, setting, comm) and not (arguments.large and kind == "direct")
+        if available(kind, setting, MPI.COMM_WORLD) and not (arguments.large and kind == "direct")
     ]
+    for repeat in range(repeats):
+        if repeat:
+            problem, row = contact(made, "newton", options)
+            problem.destroy()
+        found.append([row, *(linear_row(linear, *given) for given in work)])
+    linear.A.destroy()
+    linear.b.destroy()
+    rows = [min(runs, key=price) for runs in zip(*found, strict=True)]
+    if not arguments.no_smalse:  # once: it takes its time
+        problem, row = contact(made, "smalse", options)
+        problem.destroy()
+        rows.insert(1, row)
+    return rows, problem.report
 
 
 def price(row):
@@ -332,9 +299,7 @@ def draw(path, tables):
     """The contacts and the best setting of each linear solver."""
     with picture(path, len(tables), height=2.8) as axes:
         for panel, (title, rows) in zip(axes, tables.items(), strict=True):
-            best = {}
-            for row in sorted(rows, key=price, reverse=True):
-                best[row["solver"]] = row
+            best = {row["solver"]: row for row in sorted(rows, key=price, reverse=True)}
             chosen = [row for row in rows if row is best[row["solver"]]]
             stacked(panel, title.split(":")[0], chosen, ["set-up", "solve"])
 
@@ -344,12 +309,13 @@ def main(argv):
     arguments, rest = command_line(__doc__, argv, configure)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
     repeats = 1 if arguments.quick else arguments.repeats
-    options, comm, unit = petsc_options(rest), MPI.COMM_WORLD, choose_clock(arguments)
+    options, ranks, unit = petsc_options(rest), MPI.COMM_WORLD.size, choose_clock(arguments)
     tables = {}
     for name in arguments.scenes:
-        rows, report = study(name, SIZES[size][name], options, repeats, arguments)
+        made = scene(name, SCENES[name][size])
+        rows, report = study(made, options, repeats, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"
-        tables[f"{name}: {sizes}, {comm.size} ranks, {unit}"] = with_ratios(rows)
+        tables[f"{name}: {sizes}, {ranks} ranks, {unit}"] = with_ratios(rows)
 
     def shown(found):
         """The tables by the names of their demos."""

@@ -19,12 +19,11 @@ results/solver_profiles.md and .json.
 from __future__ import annotations
 
 import logging
-import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -37,55 +36,18 @@ from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Answer, Untorn
 from benchmarks.stress.scene import Scene
 from benchmarks.stress.solve import UnsettledError
-from benchmarks.tools import choose_clock, command_line, configure_clock, finish
+from benchmarks.tools import choose_clock, command_line, configure_clock, finish, limited, say
 
-PRECONDITIONERS = ("none", "lumped", "dirichlet")
-CONTACT = [*(("newton", pc) for pc in PRECONDITIONERS), ("smalse", "none")]
-LINEAR = [("pcpg", pc) for pc in PRECONDITIONERS]
-DEFAULT = {True: ("newton", "dirichlet"), False: ("pcpg", "dirichlet")}
+# of scenes with contact and without, the default first
+SOLVERS = {
+    True: ["newton, dirichlet", "newton, lumped", "newton, none", "smalse, none"],
+    False: ["pcpg, dirichlet", "pcpg, lumped", "pcpg, none"],
+}
 TOLERANCES = (1e-4, 1e-8)
 WITHIN = 100.0  # of rtol, and of the noise of the direct solution
 NEAR = 2.0  # of the best
 TAUS = (1.0, 1.5, 2.0, 4.0, 8.0, 16.0)
-NAMES = ("scene", "kind", "cell", "bodies", "friction", "rtol")
-T = TypeVar("T")
 BEAMS, MODULI = (2.0, 5.0, 10.0, 20.0, 50.0), (1.0, 1e2, 1e4)
-
-
-def configure(parser):
-    parser.add_argument(
-        "--scenes", type=int, default=100, help="how many, but for blocks and beams"
-    )
-    parser.add_argument("--steps", type=int, default=1000, help="most steps of a solver")
-    parser.add_argument("--seed", type=int, default=0, help="the first seed")
-    parser.add_argument("--limit", type=int, default=60, help="most seconds of a solve, whole")
-    parser.add_argument("--default", action="store_true", help="the default solvers only")
-    configure_clock(parser)
-
-
-class LateError(Exception):
-    """Something has taken too long."""
-
-
-def limited(seconds: int, run: Callable[[], T]) -> T:
-    """What a function returns within so many seconds; on several ranks they do not count.
-
-    Raises:
-        LateError: It has not returned.
-    """
-
-    def ring(*_: object) -> None:
-        raise LateError(f"beyond {seconds} s")
-
-    if MPI.COMM_WORLD.size > 1:
-        return run()
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.alarm(seconds)
-    try:
-        return run()
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def scenes(count: int, seed: int, quick: bool) -> Iterator[tuple[str, Scene]]:
@@ -116,28 +78,22 @@ def described(name: str, scene: Scene) -> dict[str, Any]:
     }
 
 
-def cost(
-    scene: Scene, g: meshes.Grid, answer: Answer | None, steps: int, work: tuple[str, str, float]
-):
+def cost(scene: Scene, g: meshes.Grid, answer: Answer | None, options: dict[str, Any]):
     """Multiplications and seconds of a solve, None where it fails; and why."""
-    qp_type, pc_type, rtol = work
-    options = {"tfeti_qp_type": qp_type, "tfeti_pc_type": pc_type, "tfeti_rtol": rtol}
-    scene = replace(scene, options={**options, "tfeti_max_it": steps})
+    scene = replace(scene, options=options)
     outcome = solve_scene(scene, g, MPI.COMM_WORLD)
     why = outcome.error
     if answer is not None and not why:
         found = judged(scene, g, outcome, answer)
         if "u" in found:
-            errors = np.maximum(found["errors"], found["jump"])
+            wrong = np.maximum(found["errors"], found["jump"])
             # a body that does not move has what rounding of its points makes of that
             noise = np.maximum(found["noise"], found["of points"])
-            if np.any(errors > WITHIN * np.maximum(rtol, noise)):
+            if np.any(wrong > WITHIN * np.maximum(options["tfeti_rtol"], noise)):
                 why = f"wrong by {found['u']:.1e}"
-    why = MPI.COMM_WORLD.bcast(why)
-    report = outcome.report
-    if why:
+    if why := MPI.COMM_WORLD.bcast(why):
         return None, None, why
-    return report["F"] + report["S"], report["qp"], ""
+    return outcome.report["F"] + outcome.report["S"], outcome.report["qp"], ""
 
 
 def direct(scene: Scene, g: meshes.Grid, steps: int, limit: int) -> tuple[bool, Answer | None]:
@@ -148,49 +104,40 @@ def direct(scene: Scene, g: meshes.Grid, steps: int, limit: int) -> tuple[bool, 
         outcome = limited(limit, lambda: solve_scene(scene, g, comm))
         if comm.rank == 0 and not outcome.error.startswith(("NoSolutionError", "InputError")):
             answer = limited(limit, Untorn(scene, g, outcome.mu, outcome.lmbda).answer)
-    except (LateError, UnsettledError, RuntimeError, np.linalg.LinAlgError) as error:
+    except (TimeoutError, UnsettledError, RuntimeError, np.linalg.LinAlgError) as error:
         print("no direct solution:", error, flush=True)
     return comm.bcast(answer is not None and answer.u is not None), answer
 
 
 def study(name: str, scene: Scene, arguments: Any) -> list[dict[str, Any]]:
     """A row for each tolerance, with the costs of all solvers; none if the scene takes no part."""
-    has_contact = bool(scene.walls or scene.pairs)
-    solvers = CONTACT if has_contact else LINEAR
-    solvers = [DEFAULT[has_contact]] if arguments.default else solvers
-    g, rows = meshes.grid(scene), []
+    solvers = SOLVERS[bool(scene.walls or scene.pairs)]
+    g, rows = meshes.grid(scene), list[dict[str, Any]]()
     takes_part, answer = direct(scene, g, arguments.steps, arguments.limit)
     noise = float(answer.noise.max()) if answer is not None and answer.noise is not None else 0.0
-    if not takes_part:
-        return []
-    for rtol in TOLERANCES:
+    for rtol in TOLERANCES if takes_part else ():
         rows.append({**described(name, scene), "rtol": rtol, "noise": noise})
-        for pair in solvers:
+        for key in solvers[:1] if arguments.default else solvers:
+            options = dict(zip(("tfeti_qp_type", "tfeti_pc_type"), key.split(", "), strict=True))
+            options |= {"tfeti_rtol": rtol, "tfeti_max_it": arguments.steps}
             try:
-                run = partial(cost, scene, g, answer, arguments.steps, (*pair, rtol))
+                run = partial(cost, scene, g, answer, options)
                 mults, seconds, why = limited(arguments.limit, run)
-            except LateError as late:
+            except TimeoutError as late:
                 mults, seconds, why = None, None, str(late)
-            key = "{}, {}".format(*pair)
             rows[-1] |= {key: mults, f"{key}, s": seconds, f"{key}, failed": why}
+        say(rows[-1])
     return rows
 
 
 def profiles(rows: list[dict[str, Any]], solvers, suffix: str = "") -> list[dict[str, Any]]:
     """A row for each solver: failures, and its profile at a few τ."""
-    keys = [f"{qp}, {pc}" for qp, pc in solvers]
-    values = np.array(
-        [
-            [np.inf if row[key + suffix] is None else row[key + suffix] for key in keys]
-            for row in rows
-        ]
-    ).reshape(len(rows), len(keys))
-    best = np.min(values, axis=1, keepdims=True)
+    values = np.array([[row[key + suffix] for key in solvers] for row in rows], dtype=float)
+    values[np.isnan(values)] = np.inf
     # what no solver needs anything for is a tie
-    ratio = np.where(
-        np.isinf(values), np.inf, values / np.where(np.isinf(best), 1.0, np.maximum(best, 1e-9))
-    )
-    ratio = np.where((values <= 1e-9) & np.isfinite(values), 1.0, ratio)
+    best = np.maximum(np.min(values, axis=1, keepdims=True), 1e-9)
+    with np.errstate(invalid="ignore"):
+        ratio = np.where(np.isinf(values), np.inf, np.maximum(values, 1e-9) / best)
     return [
         {
             "solver": key,
@@ -198,7 +145,7 @@ def profiles(rows: list[dict[str, Any]], solvers, suffix: str = "") -> list[dict
             "failed": int(np.isinf(values[:, k]).sum()),
             **{f"τ = {tau:g}": float(np.mean(ratio[:, k] <= tau)) for tau in TAUS},
         }
-        for k, key in enumerate(keys)
+        for k, key in enumerate(solvers)
     ]
 
 
@@ -206,36 +153,43 @@ def tabled(rows: list[dict[str, Any]], unit: str) -> dict[str, list[dict[str, An
     """Profiles of multiplications and seconds, and what failed by default."""
     tables: dict[str, list[dict[str, Any]]] = {}
     reached = [row for row in rows if row["noise"] <= row["rtol"]]
-    for has_contact, solvers in ((True, CONTACT), (False, LINEAR)):
-        default = "{}, {}".format(*DEFAULT[has_contact])
-        own = [row for row in reached if default in row]
-        # of a run that was ended, or of default solvers alone, what all rows have
-        tried = [pair for pair in solvers if all("{}, {}".format(*pair) in row for row in own)]
-        if own:
+    for has_contact, solvers in SOLVERS.items():
+        if own := [row for row in reached if solvers[0] in row]:
+            tried = [key for key in solvers if all(key in row for row in own)]
             what = "contact" if has_contact else "no contact"
             tables[f"{what}, multiplications"] = profiles(own, tried)
             tables[f"{what}, {unit}"] = profiles(own, tried, ", s")
-    failed = "default failed, or needs more than twice the best"
-    below = [row for row in rows if row not in reached]
-    for title, some in ((failed, reached), ("below what rounding leaves", below)):
-        worst = [row for row in map(_beside_best, some) if row]
-        if worst := [row for row in worst if title != failed or row["bad"]]:
-            tables[title] = [{k: v for k, v in row.items() if k != "bad"} for row in worst]
+    for title, some in (
+        ("default failed, or needs more than twice the best", reached),
+        ("below what rounding leaves", [row for row in rows if row not in reached]),
+    ):
+        worst = [_beside_best(row) for row in some]
+        worst = [row for row, bad in worst if bad or some is not reached]
+        if worst:
+            tables[title] = worst
     return tables
 
 
-def _beside_best(row: dict[str, Any]) -> dict[str, Any]:
-    """What the default solver and the best one need; nothing where the default was not tried."""
-    for default in DEFAULT.values():
-        key = "{}, {}".format(*default)
-        others = [row[k] for k in row if k + ", failed" in row and row[k] is not None]
-        if key in row:
-            bad = row[key] is None or row[key] > NEAR * min(others)
-            found = {"default": "-" if row[key] is None else row[key]}
-            found |= {"best": min(others, default="-"), "bad": bad}
-            why = row[f"{key}, failed"].replace("|", "/")
-            return {**{name: row[name] for name in NAMES}, **found, "why": why}
-    return {}
+def _beside_best(row: dict[str, Any]) -> tuple[dict[str, Any], bool]:
+    """What the default solver and the best one need, and whether that is bad."""
+    (key,) = (solvers[0] for solvers in SOLVERS.values() if solvers[0] in row)
+    costs = [row[k] for k in row if k + ", failed" in row and row[k] is not None]
+    names = ("scene", "kind", "cell", "bodies", "friction", "rtol")
+    found = {"default": row[key], "best": min(costs, default=None)}
+    why = row[f"{key}, failed"].replace("|", "/")
+    bad = row[key] is None or row[key] > NEAR * found["best"]
+    return {**{name: row[name] for name in names}, **found, "why": why}, bad
+
+
+def configure(parser):
+    parser.add_argument(
+        "--scenes", type=int, default=100, help="how many, but for blocks and beams"
+    )
+    parser.add_argument("--steps", type=int, default=1000, help="most steps of a solver")
+    parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument("--limit", type=int, default=60, help="most seconds of a solve, whole")
+    parser.add_argument("--default", action="store_true", help="the default solvers only")
+    configure_clock(parser)
 
 
 def main(argv):
@@ -243,13 +197,12 @@ def main(argv):
     arguments, _ = command_line(__doc__, argv, configure)
     unit, before = choose_clock(arguments), logging.root.manager.disable
     logging.disable(logging.WARNING)
-    count, rank = 2 if arguments.quick else arguments.scenes, MPI.COMM_WORLD.rank
+    count = 2 if arguments.quick else arguments.scenes
     rows: list[dict[str, Any]] = []
     for name, scene in scenes(count, arguments.seed, arguments.quick):
-        rows += (found := study(name, scene, arguments))
-        if rank == 0:
-            print(name, *(row.values() for row in found), flush=True)
+        rows += study(name, scene, arguments)
     logging.disable(before)
+    rank = MPI.COMM_WORLD.rank
     tables = MPI.COMM_WORLD.bcast(tabled(rows, unit) if rank == 0 else None)
     return finish(arguments, "solver_profiles", tables)
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
@@ -25,6 +24,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 import tfeti_dolfinx as tfeti
+from benchmarks.elastic import Elastic
 from benchmarks.tools import column, command_line, curves, finish, picture
 from tfeti_dolfinx.bem.panels import Panels, surfaces
 from tfeti_dolfinx.bem.steklov import IsotropicLaw, steklov
@@ -37,13 +37,13 @@ SIZES = {
     "default": {2: ((4, 8, 16, 32), (2, 4, 8)), 3: ((2, 4, 8), (2, 3, 4))},
 }
 NU = 0.3
-MODELS = {2: "plane_strain", 3: None}
+MODELS = {2: "plane_strain", 3: "3d"}
 # of eigenvalues; the rest of a table is exact
 ACCURACY = 1e-3
 
 
-def cut_mesh(gdim, parts, cells):
-    """The torn unit square or cube of parts^d subdomains of cells^d elements, clamped at x = 0."""
+def cut(gdim, parts, cells):
+    """A unit square or cube of parts^d subdomains of cells^d elements; "left" is at x = 0."""
     n = [parts * cells] * gdim
     create = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
     kind = dmesh.CellType.quadrilateral if gdim == 2 else dmesh.CellType.hexahedron
@@ -55,30 +55,16 @@ def cut_mesh(gdim, parts, cells):
         places = np.minimum((x[:gdim] * parts).astype(int), parts - 1)
         return np.ravel_multi_index(tuple(places), (parts,) * gdim)
 
-    return tfeti.decompose(mesh, subdomain, facet_tags=tags, surfaces={"left": 1})
+    d = tfeti.decompose(mesh, subdomain, facet_tags=tags, surfaces={"left": 1})
+    return Elastic(d, 1.0, NU, MODELS[gdim])
 
 
-def space(decomposition):
-    """Displacements, and their bilinear form."""
-    gdim = decomposition.mesh.geometry.dim
-    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=NU, model=MODELS[gdim])
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
-    return V, elastic.a(ufl.TrialFunction(V), ufl.TestFunction(V))
-
-
-def solved(gdim, parts, cells, boundary):
+def solved(body, boundary):
     """The problem with its dual operator; without a load it is solved at once."""
-    decomposition = cut_mesh(gdim, parts, cells)
-    V, a = space(decomposition)
-    fixed = fem.locate_dofs_topological(V, gdim - 1, decomposition.facets("left"))
-    problem = tfeti.ContactProblem(
-        a,
-        ufl.ZeroBaseForm((ufl.TestFunction(V),)),
-        [fem.dirichletbc(np.zeros(gdim), fixed, V)],
-        [],
-        decomposition,
-        boundary_elements=tfeti.BoundaryElements() if boundary else None,
-    )
+    for axis in range(body.gdim):
+        body.hold("left", axis)
+    elements = tfeti.BoundaryElements() if boundary else None
+    problem = tfeti.ContactProblem(**body.parts([]), boundary_elements=elements)
     problem.solve()
     return problem
 
@@ -120,25 +106,25 @@ def extremes_of_S(gdim, cells, boundary):
 
     The trace of a TFETI subdomain is its boundary but for what is free: here all of it.
     """
-    whole = cut_mesh(gdim, 1, cells)
-    V, a = space(whole)
-    S = steklov_poincare(V, whole) if boundary else schur_complement(V, a)
+    whole = cut(gdim, 1, cells)
+    S = steklov_poincare(whole) if boundary else schur_complement(whole)
     values = np.linalg.eigvalsh(S)
     return float(values[gdim * (gdim + 1) // 2]), float(values[-1])
 
 
-def schur_complement(V, a):
+def schur_complement(body):
     """That of finite elements, dense."""
-    K = csr_array(assemble_csr(fem.form(a))).toarray()
-    x = V.tabulate_dof_coordinates()[:, : V.mesh.geometry.dim]
-    t = np.repeat(np.any(np.isclose(x, 0.0) | np.isclose(x, 1.0), axis=1), x.shape[1])
+    K = csr_array(assemble_csr(fem.form(body.elastic.a(body.u, body.v)))).toarray()
+    x = body.V.tabulate_dof_coordinates()[:, : body.gdim]
+    t = np.repeat(np.any(np.isclose(x, 0.0) | np.isclose(x, 1.0), axis=1), body.gdim)
     K_it = K[np.ix_(~t, t)]
     return K[np.ix_(t, t)] - K_it.T @ np.linalg.solve(K[np.ix_(~t, ~t)], K_it)
 
 
-def steklov_poincare(V, whole):
+def steklov_poincare(body):
     """That of boundary elements."""
-    (surface,) = surfaces(TornDofs(V, whole), whole, np.ones(1, dtype=bool)).values()
+    dofs, whole = TornDofs(body.V, body.decomposition), np.ones(1, dtype=bool)
+    (surface,) = surfaces(dofs, body.decomposition, whole).values()
     used, nodes = np.unique(surface.panels.nodes, return_inverse=True)
     panels = Panels(surface.panels.x[used], nodes.reshape(surface.panels.nodes.shape))
     return steklov(panels, IsotropicLaw(0.5 / (1.0 + NU), NU)).S
@@ -146,7 +132,7 @@ def steklov_poincare(V, whole):
 
 def row(gdim, parts, cells, boundary):
     """A row of a table."""
-    problem = solved(gdim, parts, cells, boundary)
+    problem = solved(cut(gdim, parts, cells), boundary)
     B, F = extremes_of_B(problem.dual.constraints), extremes_of_F(problem.dual)
     S = extremes_of_S(gdim, cells, boundary)
     found = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from benchmarks.stress.scene import GDIM, Body, Held, Load, Pair, Scene, Wall
 
@@ -45,31 +46,42 @@ def block(
     return Body(up(cell, bottom), up(cell, bottom + 1.0, 1.0), cells(cell), E, nu, jump)
 
 
-def all_of(cell: str) -> tuple[int, ...]:
-    return tuple(range(GDIM[cell]))
+def clamp(cell: str, body: int = 0, axis: int = 0, end: int = 0) -> Held:
+    """A side that does not move, by default the low end of x; axis −1 is the last one."""
+    return Held((body, axis % GDIM[cell], end), tuple(range(GDIM[cell])))
+
+
+def rollers(cell: str, body: int) -> Held:
+    """The low end of x moves up and down alone."""
+    return Held((body, 0, 0), tuple(range(GDIM[cell] - 1)))
+
+
+def press(cell: str, force: float, body: int = 0, push: float = 0.0) -> Load:
+    """A traction downwards, and along x, on the top."""
+    last = GDIM[cell] - 1
+    return Load((body, last, 1), (push,) + (0.0,) * (last - 1) + (-force,))
+
+
+def on(cell: str, upper: int, lower: int) -> Pair:
+    """A body on another one; the upper one carries the multipliers."""
+    last = GDIM[cell] - 1
+    return Pair((upper, last, 0), (lower, last, 1))
 
 
 def floor(cell: str, at: float = 0.0, body: int = 0) -> Wall:
     return Wall((body, GDIM[cell] - 1, 0), "plane", (up(cell, at), up(cell, 1.0)))
 
 
-def far_wall(cell: str, gap: float) -> Wall:
+def far_wall(cell: str, gap: float, body: int = 0, at: float = 1.0) -> Wall:
     """Beyond the high end of x."""
     rest = (0.0,) * (GDIM[cell] - 1)
-    return Wall((0, 0, 1), "plane", ((1.0 + gap, *rest), (-1.0, *rest)))
+    return Wall((body, 0, 1), "plane", ((at + gap, *rest), (-1.0, *rest)))
 
 
 def far_obstacle(cell: str, gap: float) -> Scene:
     """A steel block on the ground, pushed towards an obstacle that it does not reach."""
-    last = GDIM[cell] - 1
-    push = (PRESSURE,) + (0.0,) * last
-    return Scene(
-        cell,
-        (block(cell),),
-        held=(Held((0, last, 0), all_of(cell)),),
-        loads=(Load((0, 0, 0), push),),
-        walls=(far_wall(cell, gap),),
-    )
+    push = Load((0, 0, 0), (PRESSURE,) + (0.0,) * (GDIM[cell] - 1))
+    return Scene(cell, (block(cell),), (clamp(cell, axis=-1),), (push,), (far_wall(cell, gap),))
 
 
 def pressed(
@@ -81,15 +93,8 @@ def pressed(
     jump: float = 1.0,
 ) -> Scene:
     """A block that is clamped at one end, pressed on a floor, and maybe pushed along it."""
-    last = GDIM[cell] - 1
-    return Scene(
-        cell,
-        (block(cell, E=1.0, nu=nu, jump=jump),),
-        held=(Held((0, 0, 0), all_of(cell)),),
-        loads=(Load((0, last, 1), (push,) + (0.0,) * (last - 1) + (-1e-2,)),),
-        walls=(floor(cell, at),),
-        order=order,
-    )
+    body, load = block(cell, E=1.0, nu=nu, jump=jump), press(cell, 1e-2, push=push)
+    return Scene(cell, (body,), (clamp(cell),), (load,), (floor(cell, at),), order=order)
 
 
 def jumping(scene: Scene, jump: float) -> Scene:
@@ -99,43 +104,23 @@ def jumping(scene: Scene, jump: float) -> Scene:
 
 def two_bodies(cell: str, lower: float, upper: float) -> Scene:
     """A block that only rollers and contact hold, on a clamped one, pressed and pushed sideways."""
-    last = GDIM[cell] - 1
-    push = (-1e-3,) + (0.0,) * (last - 1) + (-1e-2,)
-    return Scene(
-        cell,
-        (block(cell, E=lower), block(cell, 1.0, E=upper)),
-        held=(Held((0, last, 0), all_of(cell)), Held((1, 0, 0), tuple(range(last)))),
-        loads=(Load((1, last, 1), push),),
-        pairs=(Pair((1, last, 0), (0, last, 1)),),
-        subdomains=6,
-    )
+    bodies = block(cell, E=lower), block(cell, 1.0, E=upper)
+    held, loads = (clamp(cell, axis=-1), rollers(cell, 1)), (press(cell, 1e-2, 1, push=-1e-3),)
+    return Scene(cell, bodies, held, loads, pairs=(on(cell, 1, 0),), subdomains=6)
 
 
 def loose_stack(cell: str, jump: float, nu: float = 0.3) -> Scene:
     """Three blocks on the floor, held by contact alone, stiff and soft."""
-    last = GDIM[cell] - 1
-    E = (1.0, jump, 1.0)
-    return Scene(
-        cell,
-        tuple(block(cell, float(k), E=E[k], nu=nu) for k in range(3)),
-        loads=(Load((2, last, 1), up(cell, -1e-2)),),
-        walls=(floor(cell),),
-        pairs=(Pair((1, last, 0), (0, last, 1)), Pair((2, last, 0), (1, last, 1))),
-        subdomains=6,
-    )
+    bodies = tuple(block(cell, float(k), E, nu) for k, E in enumerate((1.0, jump, 1.0)))
+    pairs = on(cell, 1, 0), on(cell, 2, 1)
+    loads, walls = (press(cell, 1e-2, 2),), (floor(cell),)
+    return Scene(cell, bodies, (), loads, walls, pairs, subdomains=6)
 
 
 def flat_block(cell: str, aspect: float) -> Scene:
     """A plate on the floor, clamped at one end, pressed."""
-    last = GDIM[cell] - 1
-    plate = Body(up(cell, 0.0), up(cell, 1.0 / aspect, 1.0), cells(cell), 1.0)
-    return Scene(
-        cell,
-        (plate,),
-        held=(Held((0, 0, 0), all_of(cell)),),
-        loads=(Load((0, last, 1), up(cell, -1e-3)),),
-        walls=(floor(cell),),
-    )
+    plate = Body(up(cell, 0.0), up(cell, 1.0 / aspect, 1.0), cells(cell))
+    return Scene(cell, (plate,), (clamp(cell),), (press(cell, 1e-3),), (floor(cell),))
 
 
 def strips(cell: str, aspect: float) -> Scene:
@@ -143,34 +128,25 @@ def strips(cell: str, aspect: float) -> Scene:
     last, t = GDIM[cell] - 1, 1.0 / aspect
     n = (12,) + (2,) * last
     low, high = (0.0,) * (last + 1), (1.0,) + (t,) * last
-    above = tuple(v + (t if k == last else 0.0) for k, v in enumerate(low))
-    top = tuple(v + (t if k == last else 0.0) for k, v in enumerate(high))
-    return Scene(
-        cell,
-        (Body(low, high, n), Body(above, top, n)),
-        held=(Held((0, 0, 0), all_of(cell)), Held((1, 0, 0), all_of(cell))),
-        loads=(Load((1, last, 1), up(cell, -0.1 * t**3)),),
-        pairs=(Pair((1, last, 0), (0, last, 1)),),
-        subdomains=8,
-    )
+    above, top = ((*x[:-1], x[-1] + t) for x in (low, high))
+    bodies, held = (Body(low, high, n), Body(above, top, n)), (clamp(cell), clamp(cell, 1))
+    load = press(cell, 0.1 * t**3, 1)
+    return Scene(cell, bodies, held, (load,), pairs=(on(cell, 1, 0),), subdomains=8)
 
 
 def beam(cell: str, aspect: float) -> Scene:
     """A cantilever without contact."""
     last, t = GDIM[cell] - 1, 1.0 / aspect
-    return Scene(
-        cell,
-        (Body((0.0,) * (last + 1), (1.0,) + (t,) * last, (16,) + (2,) * last),),
-        held=(Held((0, 0, 0), all_of(cell)),),
-        loads=(Load((0, last, 1), up(cell, -0.1 * t**3)),),
-        subdomains=8,
-    )
+    body = Body((0.0,) * (last + 1), (1.0,) + (t,) * last, (16,) + (2,) * last)
+    return Scene(cell, (body,), (clamp(cell),), (press(cell, 0.1 * t**3),), subdomains=8)
 
 
 def with_friction(scene: Scene, law: str, number: float) -> Scene:
     """The scene with a law of friction on all its contacts."""
-    walls = tuple(replace(wall, friction=(law, number)) for wall in scene.walls)
-    pairs = tuple(replace(pair, friction=(law, number)) for pair in scene.pairs)
+    walls, pairs = (
+        tuple(replace(contact, friction=(law, number)) for contact in contacts)
+        for contacts in (scene.walls, scene.pairs)
+    )
     return replace(scene, walls=walls, pairs=pairs)
 
 
@@ -188,16 +164,13 @@ def slivers(cell: str, strength: float) -> Scene:
 
 def thin(cell: str, slenderness: float, radius: float | None = None) -> Scene:
     """A plate above a floor that it bends down to, clamped at one end; or an arch on it."""
-    last, t = GDIM[cell] - 1, 1.0 / slenderness
-    n = (8,) + (4,) * (last - 1) + (1,)
-    plate = Body(up(cell, 0.0), up(cell, t, 1.0), n)
-    if radius is not None:
-        held = (Held((0, 0, 0), all_of(cell)), Held((0, 0, 1), all_of(cell)))
-        wall = Wall((0, last, 0), "plane", (up(cell, -1e-3), up(cell, 1.0)))
-        load = Load((0, last, 1), up(cell, -0.02 * t))
-        return Scene(cell, (plate,), held, (load,), (wall,), bent=("arch", radius))
-    load = Load((0, last, 1), up(cell, -0.1 * t**3))
-    return Scene(cell, (plate,), (Held((0, 0, 0), all_of(cell)),), (load,), (floor(cell, -0.01),))
+    t = 1.0 / slenderness
+    plate = Body(up(cell, 0.0), up(cell, t, 1.0), (8,) + (4,) * (GDIM[cell] - 2) + (1,))
+    if radius is None:
+        load, walls = press(cell, 0.1 * t**3), (floor(cell, -0.01),)
+        return Scene(cell, (plate,), (clamp(cell),), (load,), walls)
+    held, walls = (clamp(cell), clamp(cell, end=1)), (floor(cell, -1e-3),)
+    return Scene(cell, (plate,), held, (press(cell, 0.02 * t),), walls, bent=("arch", radius))
 
 
 def hanging(cell: str, hangs: float) -> Scene:
@@ -207,21 +180,21 @@ def hanging(cell: str, hangs: float) -> Scene:
     return replace(scene, bodies=bodies, hanging=bool(hangs))
 
 
+def scattered(cell: str, seed: float) -> Scene:
+    """Random subdomains, but for the seed 0."""
+    return replace(two_bodies(cell, 1.0, 1.0), scattered=int(seed) or None)
+
+
 def hinge(cell: str, joined: float) -> Scene:
     """A block beside a clamped one: 0 clamped, 1 also hanging by a corner or edge, 2 by that alone.
 
     The package takes them for two bodies that are not joined, and must say so.
     """
-    last = GDIM[cell] - 1
-    low = (1.0,) + (0.0,) * (last - 1) + (1.0,)
-    high = (2.0,) + (1.0,) * (last - 1) + (2.0,)
-    bodies = (block(cell, E=1.0), Body(low, high, cells(cell)))
-    held = (Held((0, last, 0), all_of(cell)),)
-    wall = Wall((1, 0, 1), "plane", ((2.0,) + (0.0,) * last, (-1.0,) + (0.0,) * last))
-    if joined < 2.0:
-        held = (*held, Held((1, last, 0), all_of(cell)))
-    loads = (Load((1, last, 1), up(cell, -1e-3)),)
-    return Scene(cell, bodies, held, loads, (wall,), joined=bool(joined))
+    rest = (0.0,) * (GDIM[cell] - 2)
+    beside = Body((1.0, *rest, 1.0), (2.0, *(1.0 for _ in rest), 2.0), cells(cell))
+    held = (clamp(cell, 0, -1), clamp(cell, 1, -1))[: 2 if joined < 2.0 else 1]
+    bodies, walls = (block(cell, E=1.0), beside), (far_wall(cell, 0.0, 1, 2.0),)
+    return Scene(cell, bodies, held, (press(cell, 1e-3, 1),), walls, joined=bool(joined))
 
 
 def two_obstacles(cell: str, gap: float) -> Scene:
@@ -233,58 +206,43 @@ def two_obstacles(cell: str, gap: float) -> Scene:
 
 def three_pairs(cell: str, count: float) -> Scene:
     """A block on as many blocks, beside or behind each other, that share its lower side."""
-    last, n = GDIM[cell] - 1, int(count)
+    n = int(count)
     bodies = [Body(up(cell, 1.0), up(cell, 2.0, 1.0), (6, *cells(cell)[1:]))]
     for k in range(n):
         # all of them reach to the middle of the block, so that nodes there meet them all
-        low, high = list(up(cell, 0.0)), list(up(cell, 1.0, 1.0))
-        low[0], high[0] = -0.1 * k, 1.0 + 0.1 * k
-        bodies.append(Body(tuple(low), tuple(high), cells(cell)))
-    held = tuple(Held((k + 1, last, 0), all_of(cell)) for k in range(n))
-    pairs = tuple(Pair((0, last, 0), (k + 1, last, 1)) for k in range(n))
-    rollers = Held((0, 0, 0), tuple(range(last)))
-    loads = (Load((0, last, 1), up(cell, -1e-2)),)
-    return Scene(cell, tuple(bodies), (*held, rollers), loads, (), pairs, subdomains=2 + 2 * n)
+        low, high = (-0.1 * k, *up(cell, 0.0)[1:]), (1.0 + 0.1 * k, *up(cell, 1.0, 1.0)[1:])
+        bodies.append(Body(low, high, cells(cell)))
+    held = (*(clamp(cell, k + 1, -1) for k in range(n)), rollers(cell, 0))
+    pairs, load = tuple(on(cell, 0, k + 1) for k in range(n)), press(cell, 1e-2)
+    return Scene(cell, tuple(bodies), held, (load,), (), pairs, subdomains=2 + 2 * n)
 
 
 def grazing(cell: str, more: float) -> Scene:
     """A block that its own stretching just brings to the floor, and a share more of the load."""
     last = GDIM[cell] - 1
-    body = replace(block(cell, 1e-3, E=1.0), nu=0.0)
-    held = (Held((0, last, 1), all_of(cell)),)
+    body, held = block(cell, 1e-3, E=1.0, nu=0.0), (clamp(cell, 0, -1, 1),)
     load = Load((0, last, 0), up(cell, -1e-3 * (1.0 + more)))
     return Scene(cell, (body,), held, (load,), (floor(cell),))
 
 
 def everywhere(cell: str, which: float) -> Scene:
     """0: one wall is met; 1: walls on all sides but the pressed one; 2: none is reached."""
-    last = GDIM[cell] - 1
-    scene = pressed(cell)
-    if which == 0.0:
-        return scene
-    walls, at = [floor(cell, 0.0 if which == 1.0 else -1.0)], 0.0 if which == 1.0 else 1.0
-    for axis in range(last):
-        for end in (0, 1):
-            point, normal = [0.0] * (last + 1), [0.0] * (last + 1)
-            point[axis], normal[axis] = (1.0 + at, -1.0) if end else (-at, 1.0)
-            walls.append(Wall((0, axis, end), "plane", (tuple(point), tuple(normal))))
-    if which == 1.0:
-        return replace(scene, held=(), walls=tuple(walls))
-    return replace(scene, walls=(floor(cell, -1.0), far_wall(cell, 1.0)))
+    last, scene = GDIM[cell] - 1, pressed(cell)
+    if which == 2.0:
+        return replace(scene, walls=(floor(cell, -1.0), far_wall(cell, 1.0)))
+    walls = [floor(cell)]
+    for axis, end in [(axis, end) for axis in range(last) for end in (0, 1)]:
+        point, normal = [0.0] * (last + 1), [0.0] * (last + 1)
+        point[axis], normal[axis] = (1.0, -1.0) if end else (-0.0, 1.0)
+        walls.append(Wall((0, axis, end), "plane", (tuple(point), tuple(normal))))
+    return scene if which == 0.0 else replace(scene, held=(), walls=tuple(walls))
 
 
 def in_units(cell: str, metre: float, pascal: float, law: str = "") -> Scene:
     """Two blocks of moduli 1 and 10, with another metre and pascal."""
-    scene = two_bodies(cell, 1.0, 10.0)
-    bodies = tuple(
-        Body(*(tuple(metre * v for v in x) for x in (b.low, b.high)), b.cells, b.E * pascal, b.nu)
-        for b in scene.bodies
-    )
-    loads = tuple(Load(p.side, tuple(pascal * v for v in p.value)) for p in scene.loads)
-    scene = replace(scene, bodies=bodies, loads=loads)
-    if law:
-        return with_friction(scene, law, 0.3 if law == "coulomb" else 1e-3 * pascal)
-    return scene
+    scene = two_bodies(cell, 1.0, 10.0).in_units(metre, pascal)
+    number = 0.3 if law == "coulomb" else 1e-3 * pascal
+    return with_friction(scene, law, number) if law else scene
 
 
 def to_rtol(cell: str, rtol: float, law: str = "") -> Scene:
@@ -316,12 +274,7 @@ def _ladders() -> list[Ladder]:
         Ladder("thin", "strips", strips, (*THIN, 1e4)),
         Ladder("thin", "beam", beam, (*THIN, 1e4)),
         Ladder("parts", "hang at corners", hanging, (0.0, 1.0)),
-        Ladder(
-            "parts",
-            "random",
-            lambda c, v: replace(two_bodies(c, 1.0, 1.0), scattered=int(v) or None),
-            tuple(map(float, range(6))),
-        ),
+        Ladder("parts", "random", scattered, tuple(map(float, range(6)))),
         Ladder("parts", "hinge", hinge, (0.0, 1.0, 2.0)),
         Ladder("rows", "two obstacles", two_obstacles, (0.0, -1.0, 1e-6, 1e-3)),
         Ladder("rows", "pairs of a node", three_pairs, (1.0, 2.0, 3.0)),
@@ -335,42 +288,26 @@ def _ladders() -> list[Ladder]:
 
 
 def _with_friction() -> list[Ladder]:
-    def moduli(law: str) -> Callable[[str, float], Scene]:
-        number = 0.3 if law == "coulomb" else 1e-3
-        return lambda c, v: with_friction(two_bodies(c, v, 1.0), law, number)
+    def rubbing(of: Callable[[str, float], Scene], law: str, number: float) -> Any:
+        return lambda c, v: with_friction(of(c, v), law, number)
 
-    def rubbing(cell: str, value: float) -> Scene:
+    def coefficient(cell: str, value: float) -> Scene:
         return with_friction(pressed(cell, push=-2e-3), "coulomb", value)
 
-    flat = ("triangle", "hexahedron")
+    def soft(cell: str, value: float) -> Scene:
+        return two_bodies(cell, value, 1.0)
+
     units = range(len(UNITS))
-    return [
-        Ladder("friction", "Tresca, moduli", moduli("tresca"), MODULI, flat),
-        Ladder("friction", "Coulomb, moduli", moduli("coulomb"), MODULI, flat),
-        Ladder("friction", "Coulomb, coefficient", rubbing, (0.1, 1e-3, 0.5, 1.0, 10.0), flat),
-        Ladder(
-            "friction",
-            "Coulomb, nu",
-            lambda c, v: with_friction(pressed(c, v), "coulomb", 0.3),
-            NU,
-            flat,
-        ),
-        Ladder(
-            "friction",
-            "Coulomb, layers",
-            lambda c, v: with_friction(layered(c, v), "coulomb", 0.3),
-            ASPECTS,
-            flat,
-        ),
-        Ladder(
-            "friction",
-            "Coulomb, units",
-            lambda c, v: in_units(c, *UNITS[int(v)], "coulomb"),
-            units,
-            flat,
-        ),
-        Ladder("friction", "Coulomb, rtol", lambda c, v: to_rtol(c, v, "coulomb"), RTOL, flat),
+    found = [
+        ("Tresca, moduli", rubbing(soft, "tresca", 1e-3), MODULI),
+        ("Coulomb, moduli", rubbing(soft, "coulomb", 0.3), MODULI),
+        ("Coulomb, coefficient", coefficient, (0.1, 1e-3, 0.5, 1.0, 10.0)),
+        ("Coulomb, nu", rubbing(pressed, "coulomb", 0.3), NU),
+        ("Coulomb, layers", rubbing(layered, "coulomb", 0.3), ASPECTS),
+        ("Coulomb, units", lambda c, v: in_units(c, *UNITS[int(v)], "coulomb"), units),
+        ("Coulomb, rtol", lambda c, v: to_rtol(c, v, "coulomb"), RTOL),
     ]
+    return [Ladder("friction", *given, ("triangle", "hexahedron")) for given in found]
 
 
 LADDERS = _ladders()

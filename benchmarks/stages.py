@@ -2,7 +2,7 @@
 
     ./run mpirun -n 2 python3 benchmarks/stages.py [--quick | --large] [--processor]
 
-Memory is what all ranks have in use when a stage ends, and what their processes hold then: what is
+Memory is what all ranks have in use when a stage ends, not what their processes hold then: what is
 freed may stay theirs (Open MPI wants it so), and is used for what comes later. Results go to
 results/stages.md and .json.
 """
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from pathlib import Path
 from typing import ClassVar
 
 from mpi4py import MPI
@@ -20,50 +19,13 @@ import tfeti_dolfinx as tfeti
 from benchmarks.tools import STAGES, choose_clock, command_line, configure_clock, finish
 from demos import petsc_options, scene
 
-DEMOS = ("cube_3d", "hertz_3d")
-# unknowns and subdomains of the half ball
-QUICK, SMALL, MIDDLE, LARGE = (4_000, 4), (60_000, 16), (235_000, 64), (2_090_000, 256)
-
-
-def sizes(default, large):
-    """Arguments of both demos, quick, default and large; those of the half ball are given."""
-    cubes = {"quick": (8, 4), "default": (64, 10), "large": (512, 10)}
-    balls = {"quick": QUICK, "default": default, "large": large}
-    return {
-        name: {
-            "cube_3d": dict(zip(("subdomains", "cells"), cubes[name], strict=True)),
-            "hertz_3d": dict(zip(("unknowns", "subdomains"), balls[name], strict=True)),
-        }
-        for name in cubes
-    }
-
-
-SIZES = sizes(SMALL, MIDDLE)
-STATUS = Path("/proc/self/status")
-
-
-class Watched(dict):
-    """Seconds of stages that also notes what memory this rank has when a stage ends.
-
-    Args:
-        seconds: Of the mesh, and of what else is known.
-        mesh: ``memory()`` when the mesh was made.
-
-    Attributes:
-        memory: Megabytes in use, and held, at the end of each stage.
-    """
-
-    def __init__(self, seconds, mesh):
-        self.memory = {"mesh": mesh}
-        super().__init__(seconds)
-
-    def __setitem__(self, name, value):
-        super().__setitem__(name, value)
-        self.memory.setdefault(name, memory())  # at its first end: contact comes back at the last
-
-    def __reduce__(self):
-        """What travels between ranks is the seconds."""
-        return dict, (dict(self),)
+# arguments of the demos, by the size of the run
+CUBES = {"quick": (8, 4), "default": (64, 10), "large": (512, 10)}
+BALLS = {"quick": (4_000, 4), "default": (60_000, 16), "large": (235_000, 64)}
+DEMOS = {
+    "cube_3d": {name: ["--subdomains", n, "--cells", m] for name, (n, m) in CUBES.items()},
+    "hertz_3d": {name: ["--unknowns", m, "--subdomains", n] for name, (m, n) in BALLS.items()},
+}
 
 
 class Mallinfo(ctypes.Structure):
@@ -74,45 +36,42 @@ class Mallinfo(ctypes.Structure):
 
 
 def memory():
-    """Megabytes that this process has in use, and those that it holds. Without glibc the same."""
-    (line,) = (line for line in STATUS.read_text().splitlines() if line.startswith("VmRSS"))
-    held = float(line.split()[1]) / 1024
-    try:
-        mallinfo = ctypes.CDLL(None).mallinfo2
-    except AttributeError:
-        return held, held
+    """Megabytes that this process has in use."""
+    mallinfo = ctypes.CDLL(None).mallinfo2
     mallinfo.restype = Mallinfo
     info = mallinfo()
-    return (info.uordblks + info.hblkhd) / 2**20, held
+    return (info.uordblks + info.hblkhd) / 2**20
 
 
-def words_of(size):
-    """Arguments of a demo's command line."""
-    return [word for name, value in size.items() for word in (f"--{name}", value)]
+class Watched(dict):
+    """Seconds of stages that also notes what memory this rank has when a stage first ends."""
+
+    def __init__(self, seconds):
+        self.memory = {"mesh": memory()}
+        super().__init__(seconds)
+
+    def __setitem__(self, name, value):
+        super().__setitem__(name, value)
+        self.memory.setdefault(name, memory())
+
+    def __reduce__(self):
+        """What travels between ranks is the seconds."""
+        return dict, (dict(self),)
 
 
-def solved(demo, size, options):
-    """The report of a scene, its seconds watched."""
-    made = scene(demo, words_of(size))
-    mesh = memory()
+def table(made, options):
+    """Unknowns, and a row for each stage. Collective."""
     problem = tfeti.ContactProblem(**made, petsc_options={"tfeti_qp_type": "newton", **options})
-    seconds = problem._seconds = Watched(problem._seconds, mesh)
+    seconds = problem._seconds = Watched(problem._seconds)
     problem.solve()
     problem.destroy()
-    return problem.report, seconds
-
-
-def stage_rows(seconds):
-    """A row for each stage. Collective."""
-    comm = MPI.COMM_WORLD
     whole = sum(seconds.get(name, 0.0) for name in STAGES)
-    return [
+    return problem.report.primal_dofs, [
         {
             "stage": name,
             "seconds": seconds[name],
             "share": seconds[name] / whole,
-            "MB in use": comm.allreduce(seconds.memory[name][0]),
-            "MB held": comm.allreduce(seconds.memory[name][1]),
+            "MB in use": MPI.COMM_WORLD.allreduce(seconds.memory[name]),
         }
         for name in STAGES
         if name in seconds
@@ -128,11 +87,10 @@ def main(argv):
     """Run the scenes and write their tables; returns them."""
     arguments, rest = command_line(__doc__, argv, configure)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
-    comm, tables, unit = MPI.COMM_WORLD, {}, choose_clock(arguments)
-    for name in DEMOS:
-        report, seconds = solved(name, SIZES[size][name], petsc_options(rest))
-        title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks, {unit}"
-        tables[title] = stage_rows(seconds)
+    tables, unit = {}, choose_clock(arguments)
+    for name, words in DEMOS.items():
+        unknowns, rows = table(scene(name, words[size]), petsc_options(rest))
+        tables[f"{name}, {unknowns} unknowns, {MPI.COMM_WORLD.size} ranks, {unit}"] = rows
     return finish(arguments, "stages", tables)
 
 

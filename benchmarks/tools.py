@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -107,6 +108,27 @@ def say(row: Mapping[str, Any]) -> None:
     """Print a row on rank 0 at once: large scenes take their time."""
     if MPI.COMM_WORLD.rank == 0:
         print(*map(_text, row.values()), sep=" | ", flush=True)
+
+
+def limited(seconds: int, run: Callable[[], Any]) -> Any:
+    """What a function returns within so many seconds; on several ranks they do not count.
+
+    Raises:
+        TimeoutError: It has not returned.
+    """
+
+    def ring(*_: object) -> None:
+        raise TimeoutError(f"beyond {seconds} s")
+
+    if MPI.COMM_WORLD.size > 1:
+        return run()
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(seconds)
+    try:
+        return run()
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def over_seeds(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from math import log, pi, sqrt
 from types import SimpleNamespace
@@ -36,36 +35,34 @@ COMM = MPI.COMM_WORLD
 FINE = 0.4
 
 
-@dataclass
-class Row:
-    """A figure of a case."""
+Row = dict[str, Any]
 
-    case: str  # its name, with its source
-    quantity: str  # the figure
-    reference: float  # the published figure, or the closed form
-    got: float  # ours
-    # relative difference that the source allows, or None where it is for information
-    allowed: float | None
-    problem: Any  # what has the report
-    multiplications: int | None = None  # by F and S in all; None: those of the last solve
 
-    @property
-    def difference(self) -> float:
-        """Relative; of an error, whose reference is 0, itself."""
-        return (self.got - self.reference) / (abs(self.reference) or 1.0)
+def figure(
+    case: str,
+    quantity: str,
+    reference: float,
+    got: float,
+    allowed: float | None,
+    problem: Any,
+    multiplications: int | None = None,
+) -> Row:
+    """A row: a published figure, or that of a closed form, and ours.
 
-    def columns(self) -> dict[str, Any]:
-        """Row of the table; to be asked for before the next solve."""
-        return {
-            "case": self.case,
-            "quantity": self.quantity,
-            "reference": f"{self.reference:.5g}",
-            "got": f"{self.got:.5g}",
-            "difference": f"{100 * self.difference:+.2f} %",
-            "allowed": None if self.allowed is None else f"{100 * self.allowed:g} %",
-            "unknowns": self.problem.report.primal_dofs,
-            "F + S": work(self.problem) if self.multiplications is None else self.multiplications,
-        }
+    Relative differences, but of an error, whose reference is 0, itself; ``allowed`` by the source,
+    None where a figure is for information. Multiplications are those of the last solve by default.
+    """
+    difference = (got - reference) / (abs(reference) or 1.0)
+    return {
+        "case": case,
+        "quantity": quantity,
+        "reference": f"{reference:.5g}",
+        "got": f"{got:.5g}",
+        "difference": f"{100 * difference:+.2f} %",
+        "allowed": None if allowed is None else f"{100 * allowed:g} %",
+        "unknowns": problem.report.primal_dofs,
+        "F + S": work(problem) if multiplications is None else multiplications,
+    }
 
 
 def work(problem: tfeti.ContactProblem) -> int:
@@ -182,20 +179,38 @@ def contact_force(problem: tfeti.ContactProblem) -> float:
 
 
 def point_contact(
-    case: str, problem: tfeti.ContactProblem, radius: float, modulus: float
-) -> list[Row]:
-    """Peak pressure and radius of an axisymmetric contact beside Hertz's for the computed force.
+    case: str,
+    mesh: tuple[float, float],
+    ball: tuple[float, float, float, float],
+    partner: tuple[Any, float],
+    published: tuple[float, float, float | None],
+) -> tuple[list[Row], tfeti.ContactProblem]:
+    """a and p₀ of half a ball on an obstacle, beside Hertz's for the computed force. Collective.
 
-    Collective. 1/R = 1/R₁ + 1/R₂; the modulus is E*.
+    Args:
+        case: Its name.
+        mesh: Size of elements, and how far from the origin.
+        ball: R, E, ν, and how far its top goes down.
+        partner: The obstacle's shape, and Hertz's R, 1/R = 1/R₁ + 1/R₂.
+        published: a, p₀, and what the source allows.
     """
+    R, E, nu, down = ball
+    scene = Elastic(quarter_disc(R, *mesh), E, nu, "axisymmetric")
+    scene.hold("axis", 0)
+    scene.hold("top", 1, -down)
+    problem = scene.problem([tfeti.Obstacle("arc", partner[0], reach=4 * down)])
+    problem.solve()
     data = problem.solution.contact()
-    hertz = PointContact.from_load(contact_force(problem), radius, modulus)
+    hertz = PointContact.from_load(contact_force(problem), partner[1], E / (1 - nu**2))
     found = fit(COMM, data.points[:, 0], data.pressure, hertz.peak)
-    names = zip(("a", "p₀"), (hertz.half_width, hertz.peak), found, strict=True)
-    return [
-        Row(case, f"{name} of the force, Hertz", expected, got, 0.01, problem)
-        for name, expected, got in names
+    own, names = (hertz.half_width, hertz.peak), ("a", "p₀")
+    rows = [
+        figure(case, f"{name} of the force, Hertz", expected, got, 0.01, problem)
+        for name, expected, got in zip(names, own, found, strict=True)
     ]
+    for name, expected, got in zip(names, published, found, strict=False):
+        rows.append(figure(case, f"{name}, published", expected, got, published[2], problem))
+    return rows, problem
 
 
 # --- Cases ------------------------------------------------------------------------------------
@@ -203,19 +218,11 @@ def point_contact(
 
 def hemispheres(scale: float) -> Iterator[Row]:
     """Two equal hemispheres pressed together: one of them against the plane between them."""
-    R, E, nu = 50.0, 2e4, 0.3
     for approach, peak, radius in ((2.0, 1978.7, 7.071), (4.0, 2798.3, 10.0)):
-        scene = Elastic(quarter_disc(R, scale * 0.6, 1.5 * radius), E, nu, "axisymmetric")
-        scene.hold("axis", 0)
-        scene.hold("top", 1, -approach / 2)
-        plane = tfeti.Obstacle("arc", tfeti.Plane((0, 0), normal=(0, 1)), reach=2 * approach)
-        problem = scene.problem([plane])
-        problem.solve()
         case = f"SSNV104, two hemispheres, approach {approach:g}"
-        rows = point_contact(case, problem, R, E / (1 - nu**2))
-        yield from rows
-        for row, name, published in zip(rows, ("a", "p₀"), (radius, peak), strict=True):
-            yield Row(case, f"{name}, published", published, row.got, 0.15, problem)
+        mesh, ball = (scale * 0.6, 1.5 * radius), (50.0, 2e4, 0.3, approach / 2)
+        plane = tfeti.Plane((0, 0), normal=(0, 1))
+        yield from point_contact(case, mesh, ball, (plane, 50.0), (radius, peak, 0.15))[0]
 
 
 def steel_on_aluminium(scale: float) -> Iterator[Row]:
@@ -237,8 +244,8 @@ def steel_on_aluminium(scale: float) -> Iterator[Row]:
     data = problem.solution.contact()
     a, p0 = fit(COMM, data.points[:, 0], data.pressure, hertz.peak)
     case = "NAFEMS B1 (SSNP154), cylinder on block"
-    yield Row(case, "p₀", 3585.4, p0, 0.01, problem)
-    yield Row(case, "a", 6.21, a, 0.01, problem)
+    yield figure(case, "p₀", 3585.4, p0, 0.01, problem)
+    yield figure(case, "a", 6.21, a, 0.01, problem)
 
 
 def sliding_wedge(scale: float) -> Iterator[Row]:
@@ -266,7 +273,7 @@ def sliding_wedge(scale: float) -> Iterator[Row]:
                 low = force
             total += work(problem)
         case = "NAFEMS CGS-4, sliding wedge"
-        yield Row(case, f"F/G, μ = {mu:g}", published, low / weight, 0.002, problem, total)
+        yield figure(case, f"F/G, μ = {mu:g}", published, low / weight, 0.002, problem, total)
 
 
 def concentric_rings(scale: float) -> Iterator[Row]:
@@ -283,9 +290,9 @@ def concentric_rings(scale: float) -> Iterator[Row]:
     powers = np.array([data.pressure, (data.pressure - published) ** 2, np.ones_like(data.area)])
     total, squares, area = COMM.allreduce(powers @ data.area)
     case = "SSNP152, concentric rings"
-    yield Row(case, "mean pressure", published, total / area, 0.007, problem)
+    yield figure(case, "mean pressure", published, total / area, 0.007, problem)
     error = sqrt(squares / area) / published
-    yield Row(case, "relative L² error of the pressure", 0.0, error, 0.007, problem)
+    yield figure(case, "relative L² error of the pressure", 0.0, error, 0.007, problem)
 
 
 def patches(scale: float) -> Iterator[Row]:
@@ -310,24 +317,17 @@ def patches(scale: float) -> Iterator[Row]:
         worst = np.max(np.abs(data.pressure - pressure), initial=0.0)
         worst = COMM.allreduce(worst, op=MPI.MAX)
         case = f"{'SSNP121' if gdim == 2 else 'SSNV167'}, patch test"
-        yield Row(case, "pressure, worst node", pressure, pressure + worst, 1e-6, problem)
+        yield figure(case, "pressure, worst node", pressure, pressure + worst, 1e-6, problem)
 
 
 def rigid_sphere(scale: float) -> Iterator[Row]:
     """An elastic ball on a rigid one of the same radius."""
-    R, E, nu, d = 2.0, 1.40625e7, 0.25, 0.01
-    scene = Elastic(quarter_disc(R, scale * 0.01, 0.15), E, nu, "axisymmetric")
-    scene.hold("axis", 0)
-    scene.hold("top", 1, -d)
-    ball = tfeti.Obstacle("arc", tfeti.Sphere((0.0, -R), R), reach=4 * d)
-    problem = scene.problem([ball])
-    problem.solve()
-    case = "MOOSE, rigid sphere"
-    rows = point_contact(case, problem, R / 2, E / (1 - nu**2))
+    case, R = "MOOSE, rigid sphere", 2.0
+    mesh, ball = (scale * 0.01, 0.15), (R, 1.40625e7, 0.25, 0.01)
+    rigid = tfeti.Sphere((0.0, -R), R)
+    rows, problem = point_contact(case, mesh, ball, (rigid, R / 2), (0.1, 9.55e5, None))
     yield from rows
-    published = (("a", 0.1, rows[0].got), ("p₀", 9.55e5, rows[1].got))
-    for name, figure, got in (*published, ("F", 2.0e4, contact_force(problem))):
-        yield Row(case, f"{name}, published", figure, got, None, problem)
+    yield figure(case, "F, published", 2.0e4, contact_force(problem), None, problem)
 
 
 def press_fit(scale: float) -> Iterator[Row]:
@@ -340,7 +340,7 @@ def press_fit(scale: float) -> Iterator[Row]:
     data = problem.solution.contact()
     total, area = COMM.allreduce(np.array([data.area @ data.pressure, data.area.sum()]))
     lame, case = lame_pressure(overlap), "press fit (Lamé)"
-    yield Row(case, "mean pressure", lame, total / area, 0.01, problem)
+    yield figure(case, "mean pressure", lame, total / area, 0.01, problem)
 
 
 def loaded_pin(scale: float) -> Iterator[Row]:
@@ -379,7 +379,7 @@ def loaded_pin(scale: float) -> Iterator[Row]:
         case = "NAFEMS B4 (SSNP156), loaded pin"
         allowed = None if name == "pressure at 0°" else 0.01
         finer = found[0][name]
-        yield Row(case, f"{name}, finer mesh", finer, got, allowed, problem)
+        yield figure(case, f"{name}, finer mesh", finer, got, allowed, problem)
 
 
 def bar_on_wall(scale: float) -> Iterator[Row]:
@@ -397,7 +397,7 @@ def bar_on_wall(scale: float) -> Iterator[Row]:
     of_run = SimpleNamespace(report=report)
     for quantity, published, got in rows:
         case = "SDNV100, bar on a rigid wall"
-        yield Row(case, quantity, published, got, 0.05, of_run, in_all(report))
+        yield figure(case, quantity, published, got, 0.05, of_run, in_all(report))
 
 
 def ball_above(radius: float, depth: float, x: np.ndarray) -> np.ndarray:
@@ -433,7 +433,7 @@ def plastic_indentation(scale: float) -> Iterator[Row]:
                 ("Code_Aster", other, None),
             ):
                 at = f"force at {depth:.0f}, {whose}"
-                yield Row(case, at, figure, force, limit, problem, total)
+                yield figure(case, at, figure, force, limit, problem, total)
 
 
 def thick_cylinder(scale: float) -> Iterator[Row]:
@@ -470,7 +470,9 @@ def thick_cylinder(scale: float) -> Iterator[Row]:
     force = COMM.allreduce(float(np.sum(reaction[owned])))
     pressure = force / (2 * pi * Ri * 0.1)
     limit = 2 / sqrt(3) * strength * log(Ro / Ri)
-    yield Row("thick cylinder to collapse", "limit pressure", limit, pressure, 0.01, problem, total)
+    yield figure(
+        "thick cylinder to collapse", "limit pressure", limit, pressure, 0.01, problem, total
+    )
 
 
 def taylor_bar(scale: float) -> Iterator[Row]:
@@ -521,9 +523,9 @@ def taylor_bar(scale: float) -> Iterator[Row]:
         foot = COMM.allreduce(float(values[:, 0].max(initial=0.0)), op=MPI.MAX)
         head = COMM.allreduce(float(values[:, 1].min(initial=0.0)), op=MPI.MIN)
         case, total = "SDNV103, Taylor bar", in_all(problem.report)
-        yield Row(case, f"growth of the foot, {whose}", wider, foot, allowed, problem, total)
+        yield figure(case, f"growth of the foot, {whose}", wider, foot, allowed, problem, total)
         way = f"way of the head, {whose}"
-        yield Row(case, way, shorter, flight - head, allowed, problem, total)
+        yield figure(case, way, shorter, flight - head, allowed, problem, total)
 
 
 CASES: dict[str, Callable[[float], Iterator[Row]]] = {
@@ -556,8 +558,8 @@ def main(argv: list[str]) -> Tables:
     rows = []
     for name in arguments.only or (QUICK if arguments.quick else tuple(CASES)):
         for row in CASES[name](scale):
-            rows.append(row.columns())
-            say(rows[-1])
+            rows.append(row)
+            say(row)
     return finish(arguments, "validation", {"Published cases": rows})
 
 

@@ -13,7 +13,6 @@ and Coulomb at each node. Classes in capitals must not occur; ends with 1 if one
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Callable
@@ -31,7 +30,7 @@ import tfeti_dolfinx as tfeti
 from benchmarks.stress import meshes
 from benchmarks.stress.scene import GDIM, Body, side_name
 from benchmarks.stress.scene import Scene as Boxes
-from benchmarks.tools import over_seeds, wrong
+from benchmarks.tools import limited, over_seeds, wrong
 from tfeti_dolfinx.common.compat import interpolation_points
 
 RTOL = 1e-7  # of the package
@@ -413,22 +412,14 @@ def run_scene(scene: Scene) -> dict[str, Any]:
     """Solve and check a scene; its class and figures."""
     row: dict[str, Any] = {"kind": scene.kind, "law": scene.law, "cell": scene.cell, "halved": 0}
     begin = time.perf_counter()
-
-    def late(*_: Any) -> None:
-        raise TimeoutError
-
-    signal.signal(signal.SIGALRM, late)
-    signal.alarm(SECONDS)
     try:
-        row["class"] = _solved(scene, row)
+        row["class"] = limited(SECONDS, lambda: _solved(scene, row))
     except TimeoutError:
         row["class"] = "SLOW"
     except tfeti.TfetiError as error:
         row |= {"class": "not solved", "error": f"{type(error).__name__}: {error}"}
     except Exception as error:
         row |= {"class": "CRASH", "error": f"{type(error).__name__}: {error}"}
-    finally:
-        signal.alarm(0)
     return {**row, "seconds": time.perf_counter() - begin}
 
 

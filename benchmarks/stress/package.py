@@ -159,10 +159,5 @@ def _reported(problem: tfeti.ContactProblem) -> dict[str, Any]:
         "F": report.F_multiplications,
         "S": report.preconditioner_multiplications,
         "qp": report.seconds.get("solve", 0.0),
-        "free_modes": report.free_modes,
-        "rows": report.contact_rows,
-        "active": report.active_contacts,
         "estimate": report.residuals.get("displacement_error", 0.0),
-        "penetration": report.residuals.get("penetration", 0.0),
-        "tolerance": report.residuals.get("tolerance", 0.0),
     }

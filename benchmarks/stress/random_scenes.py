@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -54,25 +54,18 @@ class Draw:
         p = self.real(0, 0.75 if self.mild else 1)
         if p < 0.5:
             return 0.0
-        return 10 ** (
-            self.real(-6, -1) if p < 0.75 else self.real(-1, 0) if p < 0.85 else self.real(0, 6)
-        )
+        ends = (-6, -1) if p < 0.75 else (-1, 0) if p < 0.85 else (0, 6)
+        return 10 ** self.real(*ends)
 
     def box(self, low: np.ndarray, size: np.ndarray) -> int:
         """A new body; its number."""
         n = self.rng.integers(1, MOST_CELLS[self.gdim] + 1, self.gdim)
         n = np.maximum(n, 2 if self.gdim == 2 else 1)
         nu = self.one(0.0, 0.49, 0.499, 0.4999) if self.spice(0.2) else self.real(0.1, 0.4)
-        self.bodies.append(
-            Body(
-                low=tuple(float(v) for v in low),
-                high=tuple(float(v) for v in low + size),
-                cells=tuple(int(v) for v in n),
-                E=10 ** self.real(-8, 0) if self.jumps else 1.0,
-                nu=nu,
-                jump=10 ** self.real(1, 8) if self.spice(0.15) else 1.0,
-            )
-        )
+        E = 10 ** self.real(-8, 0) if self.jumps else 1.0
+        jump = 10 ** self.real(1, 8) if self.spice(0.15) else 1.0
+        corners = floats(low), floats(low + size)
+        self.bodies.append(Body(*corners, tuple(int(v) for v in n), E, nu, jump))
         return len(self.bodies) - 1
 
     def size(self) -> np.ndarray:
@@ -81,18 +74,16 @@ class Draw:
         size[-1] *= self.flat
         return size
 
-    def used(self, side: Side) -> bool:
-        """Whether a side is held or meets something."""
-        return side in (
-            {h.side for h in self.held}
-            | {w.side for w in self.walls}
-            | {s for p in self.pairs for s in (p.secondary, p.primary)}
-        )
+    def free_sides(self, body: int) -> list[Side]:
+        """Sides that are not held and meet nothing."""
+        used = {c.side for c in (*self.held, *self.walls)}
+        used |= {s for p in self.pairs for s in (p.secondary, p.primary)}
+        sides = [(body, axis, end) for axis in range(self.gdim) for end in (0, 1)]
+        return [side for side in sides if side not in used]
 
     def free_side(self, body: int) -> Side | None:
-        """A side that is not held and meets nothing, if there is one."""
-        sides = [(body, axis, end) for axis in range(self.gdim) for end in (0, 1)]
-        sides = [side for side in sides if not self.used(side)]
+        """One of them, if there is one."""
+        sides = self.free_sides(body)
         return sides[self.rng.integers(len(sides))] if sides else None
 
     def hold(self, side: Side | None, components: tuple[int, ...] | None = None) -> None:
@@ -134,7 +125,7 @@ class Draw:
         else:
             depth = np.sqrt(R**2 - 0.25 * np.sum(extent**2))
             data = centre - depth * out, np.array([R + gap])
-        self.walls.append(Wall(side, kind, tuple(tuple(float(c) for c in v) for v in data)))
+        self.walls.append(Wall(side, kind, tuple(floats(v) for v in data)))
 
     def meet(self, a: Side, b: Side) -> None:
         """A pair, either side secondary."""
@@ -147,7 +138,7 @@ class Draw:
             direction = self.rng.normal(size=self.gdim)
             if self.chance(0.3):
                 direction *= self.rng.uniform(size=self.gdim) < 0.5
-        value = tuple(float(v) for v in 10 ** self.real(-1, 0) * direction)
+        value = floats(10 ** self.real(-1, 0) * direction)
         self.loads.append(Load(side or (body, -1, 0), value))
 
     def down(self) -> np.ndarray:
@@ -168,43 +159,32 @@ class Draw:
         length = 10 ** self.real(-9, 6) if self.spice(0.3) else 1.0
         modulus = 10 ** self.real(0, 12) if self.spice(0.3) else 1.0
         jump = 10 ** self.real(1, 8) if self.spice(0.12) else 1.0
-        return Scene(
+        whole = Scene(
             cell=self.cell,
-            bodies=tuple(_scaled_body(b, length, modulus) for b in self.bodies),
-            held=tuple(replace(h, value=h.value * length) for h in self.held),
-            loads=tuple(self._scaled_load(load, length, modulus * strain) for load in self.loads),
-            walls=tuple(_scaled_wall(w, length) for w in self.walls),
+            bodies=tuple(self.bodies),
+            held=tuple(self.held),
+            loads=tuple(self.loads),
+            walls=tuple(self.walls),
             pairs=tuple(self.pairs),
             subdomains=min(subdomains, cells),
             scattered=scattered,
             subdomain_jump=jump,
             note=self.note,
         )
-
-    def _scaled_load(self, load: Load, length: float, stress: float) -> Load:
-        factor = stress if load.side[1] >= 0 else stress / length
-        return replace(load, value=tuple(factor * v for v in load.value))
+        return whole.in_units(length, modulus, strain)
 
 
-def _scaled_body(b: Body, length: float, modulus: float) -> Body:
-    low, high = (tuple(length * v for v in corner) for corner in (b.low, b.high))
-    return replace(b, low=low, high=high, E=modulus * b.E)
-
-
-def _scaled_wall(w: Wall, length: float) -> Wall:
-    powers = {"plane": (1, 0), "ball": (1, 1), "bowl": (1, 1), "bump": (1, 0, -1)}[w.kind]
-    data = zip(w.data, powers, strict=True)
-    return replace(w, data=tuple(tuple(length**k * v for v in vector) for vector, k in data))
+def floats(values: Any) -> tuple[float, ...]:
+    """Plain numbers."""
+    return tuple(float(v) for v in values)
 
 
 def random_scene(seed: int) -> Scene:
     """The scene of a seed, the same everywhere."""
     draw = Draw(np.random.default_rng([seed, 2006]))
-    kind = draw.one("single", "stack", "row", "bridge", "apart")
-    draw.note = kind
-    {"single": _single, "stack": _stack, "row": _row, "bridge": _bridge, "apart": _apart}[kind](
-        draw
-    )
+    kind = draw.one(_single, _stack, _row, _bridge, _apart)
+    draw.note = kind.__name__.removeprefix("_")
+    kind(draw)
     return draw.scene()
 
 
@@ -213,9 +193,8 @@ def _single(draw: Draw) -> None:
     if draw.chance(0.75):
         draw.hold(draw.free_side(0), None if draw.chance(0.5) else tuple(range(draw.gdim)))
     for k in range(int(draw.rng.integers(0, 4))):
-        draw.wall(
-            (0, draw.up, 0) if k == 0 and not draw.used((0, draw.up, 0)) else draw.free_side(0)
-        )
+        below = (0, draw.up, 0)
+        draw.wall(below if k == 0 and below in draw.free_sides(0) else draw.free_side(0))
     for _ in range(int(draw.rng.integers(1, 3))):
         draw.push(0, draw.down() if draw.chance(0.6) else None)
 
@@ -303,7 +282,5 @@ def _apart(draw: Draw) -> None:
         if draw.chance(0.5):
             draw.wall(draw.free_side(b))
         draw.push(b, None)
-        low = (
-            low
-            + np.r_[size[0] + 10 ** draw.real(-4, 0 if draw.mild else 5), np.zeros(draw.gdim - 1)]
-        )
+        apart = 10 ** draw.real(-4, 0 if draw.mild else 5)
+        low = low + np.r_[size[0] + apart, np.zeros(draw.gdim - 1)]

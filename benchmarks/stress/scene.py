@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -88,6 +88,31 @@ class Scene:
     def gdim(self) -> int:
         """2 or 3."""
         return GDIM[self.cell]
+
+    def in_units(self, length: float, modulus: float, strain: float = 1.0) -> Scene:
+        """The scene with other units of length and of stress; loads times a strain."""
+
+        def scaled(values: Vector, power: float = 1) -> Vector:
+            return tuple(length**power * v for v in values)
+
+        powers = {"plane": (1, 0), "ball": (1, 1), "bowl": (1, 1), "bump": (1, 0, -1)}
+        loads, walls = [], []
+        for p in self.loads:
+            factor = modulus * strain / (1.0 if p.side[1] >= 0 else length)
+            loads.append(replace(p, value=tuple(factor * v for v in p.value)))
+        for w in self.walls:
+            data = zip(w.data, powers[w.kind], strict=True)
+            walls.append(replace(w, data=tuple(scaled(vector, k) for vector, k in data)))
+        return replace(
+            self,
+            bodies=tuple(
+                replace(b, low=scaled(b.low), high=scaled(b.high), E=modulus * b.E)
+                for b in self.bodies
+            ),
+            held=tuple(replace(h, value=h.value * length) for h in self.held),
+            loads=tuple(loads),
+            walls=tuple(walls),
+        )
 
     @property
     def surfaces(self) -> dict[str, int]:
