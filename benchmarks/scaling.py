@@ -30,7 +30,6 @@ from benchmarks.tools import (
     finish,
     picture,
     solve_seconds,
-    stage_seconds,
     started,
 )
 
@@ -86,7 +85,6 @@ def costs(report):
     return {
         "F": report["F_multiplications"],
         "S": report["preconditioner_multiplications"],
-        **stage_seconds(report),
         "without mesh": solve_seconds(report),
         "processor": report["processor"],
         "MB": report["peak_memory_mb"],
@@ -108,7 +106,6 @@ def weak(arguments, options):
                 "rows": report["dual_dofs"],
                 **costs(report),
                 "per million unknowns": solve_seconds(report) / report["primal_dofs"] * 1e6,
-                "kB per unknown": report["peak_memory_mb"] / report["primal_dofs"] * 1e3,
             }
             for report in best_runs(runs, arguments)
         ]

@@ -27,7 +27,6 @@ MPI_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
 FILE = "«file»"  # among words of a command: where what it finds is to be written
 # of the report; the rest of the total is the demo's own: forms, closed forms, output
 STAGES = ("mesh", "assembly", "contact", "constraints", "factors", "coarse", "solve", "recovery")
-
 # lines of what a program has printed that are shown where it fails
 SHOWN = 20
 FEW = 8  # values that all can stand beside an axis
@@ -245,11 +244,6 @@ def best_runs(
 def solve_seconds(report: dict[str, Any]) -> float:
     """Seconds of all stages but the mesh."""
     return sum(report["seconds"].get(stage, 0.0) for stage in STAGES[1:])
-
-
-def stage_seconds(report: dict[str, Any]) -> dict[str, float]:
-    """Columns of a table: seconds of each stage."""
-    return {stage: report["seconds"].get(stage, 0.0) for stage in STAGES}
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:

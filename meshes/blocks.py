@@ -1,41 +1,27 @@
-"""Blocks piled up, each with its own mesh of hexahedra.
-
-python3 meshes/blocks.py blocks.msh --partitions 16
-"""
+"""Blocks piled up, each with its own mesh of hexahedra."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from meshes.tools import partition, script, started_model
+from meshes.tools import started_model
 
 CLOSE = 1e-9
 
 
 @dataclass(frozen=True)
 class Block:
-    """A box.
+    """A box."""
 
-    Attributes:
-        name: Its name, a prefix of the names of its sides.
-        low: Lowest corner.
-        size: Edge lengths.
-        cells: Hexahedra along the edges.
-    """
-
-    name: str
-    low: tuple[float, float, float]
-    size: tuple[float, float, float]
-    cells: tuple[int, int, int]
+    name: str  # its name, a prefix of the names of its sides
+    low: tuple[float, float, float]  # lowest corner
+    size: tuple[float, float, float]  # edge lengths
+    cells: tuple[int, int, int]  # hexahedra along the edges
 
 
-def build(blocks: Sequence[Block], partitions: int = 0) -> Any:
+def build(blocks: Sequence[Block]) -> Any:
     """Mesh blocks on this rank and return gmsh's model.
 
     Physical groups: the volumes are named as the blocks, the surfaces "<block> bottom" and
@@ -43,7 +29,6 @@ def build(blocks: Sequence[Block], partitions: int = 0) -> Any:
 
     Args:
         blocks: The blocks; those that touch share no node.
-        partitions: Number of gmsh's partitions, 0 for none.
     """
     model = started_model("blocks")
     for block in blocks:
@@ -57,7 +42,6 @@ def build(blocks: Sequence[Block], partitions: int = 0) -> Any:
             level = [tag for tag in faces if abs(heights[tag] - height) < CLOSE]
             model.addPhysicalGroup(2, level, name=f"{block.name} {side}")
     model.mesh.generate(3)
-    partition(partitions)
     return model
 
 
@@ -72,18 +56,3 @@ def _structure(model: Any, volume: int, faces: list[int], block: Block) -> None:
         model.mesh.setTransfiniteSurface(face)
         model.mesh.setRecombine(2, face)
     model.mesh.setTransfiniteVolume(volume)
-
-
-def tower(cells: int = 4) -> list[Block]:
-    """Four blocks: a base, two on it side by side, and one across these."""
-    n = cells
-    return [
-        Block("base", (0.0, 0.0, 0.0), (2.0, 1.0, 0.5), (2 * n, n, n // 2)),
-        Block("left", (0.1, 0.1, 0.5), (0.7, 0.8, 0.8), (n, n + 1, n)),
-        Block("right", (1.2, 0.1, 0.5), (0.7, 0.8, 0.8), (n - 1, n - 1, n - 1)),
-        Block("beam", (0.0, 0.2, 1.3), (2.0, 0.6, 0.4), (3 * n, n, n // 2)),
-    ]
-
-
-if __name__ == "__main__":
-    script(__doc__, lambda partitions: build(tower(), partitions))

@@ -1,19 +1,12 @@
-"""Lower half of a disc on a block, both graded towards the point where they touch.
-
-python3 meshes/cylinder_on_block.py cylinder_on_block.msh --partitions 8
-"""
+"""Lower half of a disc on a block, both graded towards the point where they touch."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import gmsh
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from meshes.tools import graded_field, partition, script, started_model, use_sizes
+from meshes.tools import graded_field, started_model, use_sizes
 
 
 def build(
@@ -23,7 +16,6 @@ def build(
     fine_radius: float = 10.0,
     growth: float = 0.15,
     coarser: float = 1.3,
-    partitions: int = 0,
 ) -> Any:
     """Mesh the half disc x² + (y − R)² ≤ R², y ≤ R on the block |x| ≤ b/2, −b ≤ y ≤ 0.
 
@@ -37,7 +29,6 @@ def build(
         fine_radius: Size of the fine zone.
         growth: Growth of the element size with the distance from that zone.
         coarser: How much larger the block's elements are.
-        partitions: Number of gmsh's partitions, 0 for none.
     """
     model = started_model("cylinder_on_block")
     cylinder, arcs, load, upper_axis = _half_disc(model.geo, radius)
@@ -56,7 +47,6 @@ def build(
         graded_field(origin, coarser * fine, fine_radius, growth, (2, blocks)),
     )
     gmsh.model.mesh.generate(2)
-    partition(partitions)
     return model
 
 
@@ -89,7 +79,3 @@ def _block(geo: Any, b: float) -> tuple[list[int], list[int], list[int], int]:
         up = geo.addLine(*side)
         halves.append(geo.addPlaneSurface([geo.addCurveLoop([bottom[-1], up, top[-1], -axis])]))
     return halves, top, bottom, axis
-
-
-if __name__ == "__main__":
-    script(__doc__, build)

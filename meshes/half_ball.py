@@ -1,30 +1,19 @@
-"""Lower half of a ball, tetrahedra graded towards its lowest point.
-
-python3 meshes/half_ball.py half_ball.msh --partitions 16
-"""
+"""Lower half of a ball, tetrahedra graded towards its lowest point."""
 
 from __future__ import annotations
 
-import sys
 from math import pi
-from pathlib import Path
 from typing import Any
 
 import gmsh
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from meshes.tools import graded_size, partition, script, started_model
+from meshes.tools import graded_size, started_model
 
 HXT = 10
 
 
 def build(
-    radius: float = 1.0,
-    fine: float = 0.01,
-    fine_radius: float = 0.06,
-    growth: float = 0.3,
-    partitions: int = 0,
+    radius: float = 1.0, fine: float = 0.01, fine_radius: float = 0.06, growth: float = 0.3
 ) -> Any:
     """Mesh the half ball |x − (0, 0, R)| ≤ R, z ≤ R on this rank and return gmsh's model.
 
@@ -35,7 +24,6 @@ def build(
         fine: Element size within ``fine_radius`` of the lowest point.
         fine_radius: Size of the fine zone.
         growth: Growth of the element size with the distance from that zone.
-        partitions: Number of gmsh's partitions, 0 for none.
     """
     model = started_model("half_ball")
     ball = model.occ.addSphere(0.0, 0.0, radius, radius, angle1=-pi / 2, angle2=0.0)
@@ -49,9 +37,4 @@ def build(
     graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
     gmsh.option.setNumber("Mesh.Algorithm3D", HXT)
     gmsh.model.mesh.generate(3)
-    partition(partitions)
     return model
-
-
-if __name__ == "__main__":
-    script(__doc__, build)

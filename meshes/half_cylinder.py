@@ -5,6 +5,7 @@ python3 meshes/half_cylinder.py half_cylinder.msh --partitions 8
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import gmsh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from meshes.tools import graded_size, partition, script, started_model
+from meshes.tools import graded_size, started_model
 
 
 def build(
@@ -55,9 +56,17 @@ def build(
     model.addPhysicalGroup(1, [axis], name="axis")
     graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
     gmsh.model.mesh.generate(2)
-    partition(partitions)
+    if partitions > 1:
+        gmsh.model.mesh.partition(partitions)
     return model
 
 
 if __name__ == "__main__":
-    script(__doc__, build)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("output", type=Path, help="the .msh file to write")
+    parser.add_argument("--partitions", type=int, default=0)
+    arguments = parser.parse_args()
+    build(partitions=arguments.partitions)
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    gmsh.write(str(arguments.output))
+    gmsh.finalize()

@@ -1,27 +1,16 @@
-"""Two rectangles with a common side, graded towards its middle: pieces of two half planes.
-
-python3 meshes/half_planes.py half_planes.msh --partitions 8
-"""
+"""Two rectangles with a common side, graded towards its middle: pieces of two half planes."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import gmsh
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from meshes.tools import add_mirror_image, graded_size, partition, script, started_model
+from meshes.tools import add_mirror_image, graded_size, started_model
 
 
 def build(
-    size: float = 1.0,
-    fine: float = 0.002,
-    fine_radius: float = 0.06,
-    growth: float = 0.15,
-    partitions: int = 0,
+    size: float = 1.0, fine: float = 0.002, fine_radius: float = 0.06, growth: float = 0.15
 ) -> Any:
     """Mesh |x| ≤ L, 0 ≤ y ≤ L and its mirror image below y = 0 on this rank.
 
@@ -33,7 +22,6 @@ def build(
         fine: Element size within ``fine_radius`` of the origin.
         fine_radius: Size of the fine zone.
         growth: Growth of the element size with the distance from that zone.
-        partitions: Number of gmsh's partitions, 0 for none.
 
     Returns:
         gmsh's model.
@@ -59,9 +47,4 @@ def build(
     ):
         model.addPhysicalGroup(1, curves[0], name=name)
         model.addPhysicalGroup(1, curves[1], name=far_name)
-    partition(partitions)
     return model
-
-
-if __name__ == "__main__":
-    script(__doc__, build)

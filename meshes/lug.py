@@ -1,12 +1,7 @@
 """A pin in the bore of a lug, with a clearance, meshed independently."""
 
-import sys
-from pathlib import Path
-
 import gmsh
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
 from meshes.tools import element_options, started_model

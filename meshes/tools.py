@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import gmsh
@@ -111,21 +109,3 @@ def add_mirror_image(model: Any, axis: int) -> dict[tuple[int, int], int]:
                 images[entity], kind, tags + last_element, table[:, order].ravel()
             )
     return images
-
-
-def partition(partitions: int) -> None:
-    """Let gmsh partition the mesh with METIS, if a number is given."""
-    if partitions > 1:
-        gmsh.model.mesh.partition(partitions)
-
-
-def script(description: str | None, build: Callable[..., Any]) -> None:
-    """Command line of a mesh script: the file to write, and the number of partitions."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("output", help="the .msh file to write")
-    parser.add_argument("--partitions", type=int, default=0)
-    arguments = parser.parse_args()
-    build(partitions=arguments.partitions)
-    Path(arguments.output).parent.mkdir(parents=True, exist_ok=True)
-    gmsh.write(arguments.output)
-    gmsh.finalize()

@@ -326,7 +326,6 @@ class Check:
         self.held = np.unique(np.concatenate([nodes[name] for name in HELD[scene.kind]]))
         self.meets = [nodes[name] for name in MEETS[scene.kind]]
         self.before, self.tool = np.zeros_like(self.x), np.zeros(gdim)
-        self.worst: dict[str, float] = {}
         self._gdim, self._h = gdim, 1.0 / max(max(n) for n in scene.cells)
 
     def step(self, u: fem.Function, tool: np.ndarray, force: float | None) -> list[str]:
@@ -348,8 +347,6 @@ class Check:
             if force is not None:
                 pushed = r[self.meets[0], -1].sum()
                 found["tool"] = abs(pushed - force) / unit / RESIDUAL
-        for name, value in found.items():
-            self.worst[name] = max(self.worst.get(name, 0.0), value)
         if self.law.commit is not None:
             self.law.commit()
         self.before, self.tool = moved.copy(), tool.copy()
@@ -459,7 +456,6 @@ def _solved(scene: Scene, row: dict[str, Any]) -> str:
         advance(start, end, 0)
         start = end
     problem.destroy()
-    row["worst"] = check.worst
     if missed:
         row["error"] = "; ".join(missed[:4])
     return "WRONG" if missed else "right"
