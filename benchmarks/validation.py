@@ -14,7 +14,6 @@ from math import log, pi, sqrt
 from types import SimpleNamespace
 from typing import Any
 
-import gmsh
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -28,7 +27,7 @@ from demos import run
 from demos import scene as scene_of
 from meshes import blocks, cylinder_on_block
 from meshes.rings import lame_pressure, rings
-from meshes.tools import element_options, graded_size, started_model
+from meshes.tools import graded_size, started_model, torn
 
 COMM = MPI.COMM_WORLD
 # sizes of elements, over those of the quick run
@@ -80,36 +79,32 @@ def in_all(report: tfeti.Report) -> int:
 # --- Meshes and forms -------------------------------------------------------------------------
 
 
-def quarter_disc(radius: float, fine: float, fine_radius: float) -> tfeti.Decomposition:
+def quarter_disc(radius: float, fine: float, fine_radius: float) -> Any:
     """Half of a half disc, r ≥ 0, whose lowest point is the origin: "arc", "top", "axis"."""
-    model = None
-    if COMM.rank == 0:
-        model = started_model("quarter_disc")
-        geo = model.geo
-        lowest, centre, right = (
-            geo.addPoint(*x, 0.0) for x in ((0, 0), (0, radius), (radius, radius))
-        )
-        arc, top = geo.addCircleArc(lowest, centre, right), geo.addLine(right, centre)
-        axis = geo.addLine(centre, lowest)
-        body = geo.addPlaneSurface([geo.addCurveLoop([arc, top, axis])])
-        geo.synchronize()
-        model.addPhysicalGroup(2, [body], name="ball")
-        for name, curve in (("arc", arc), ("top", top), ("axis", axis)):
-            model.addPhysicalGroup(1, [curve], name=name)
-        graded_size((0.0, 0.0, 0.0), fine, fine_radius, 0.2)
-        gmsh.model.mesh.generate(2)
-    return tfeti.read_gmsh(model, COMM, subdomains=8)
+    model = started_model("quarter_disc")
+    geo = model.geo
+    lowest, centre, right = (geo.addPoint(*x, 0.0) for x in ((0, 0), (0, radius), (radius, radius)))
+    arc, top = geo.addCircleArc(lowest, centre, right), geo.addLine(right, centre)
+    axis = geo.addLine(centre, lowest)
+    body = geo.addPlaneSurface([geo.addCurveLoop([arc, top, axis])])
+    geo.synchronize()
+    model.addPhysicalGroup(2, [body], name="ball")
+    for name, curve in (("arc", arc), ("top", top), ("axis", axis)):
+        model.addPhysicalGroup(1, [curve], name=name)
+    graded_size((0.0, 0.0, 0.0), fine, fine_radius, 0.2)
+    model.mesh.generate(2)
+    return model
 
 
 def rectangle(
     low: tuple[float, float], high: tuple[float, float], cells: tuple[int, int]
 ) -> tfeti.Decomposition:
     """A rectangle of quadrilaterals: "bottom", "right", "top", "left"."""
-    model = None
-    if COMM.rank == 0:
+
+    def build() -> Any:
         model = started_model("rectangle")
         geo = model.geo
-        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+        corners = (low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])
         points = [geo.addPoint(*x, 0.0) for x in corners]
         sides = [geo.addLine(points[k], points[(k + 1) % 4]) for k in range(4)]
         body = geo.addPlaneSurface([geo.addCurveLoop(sides)])
@@ -121,55 +116,49 @@ def rectangle(
         model.addPhysicalGroup(2, [body], name="body")
         for name, side in zip(("bottom", "right", "top", "left"), sides, strict=True):
             model.addPhysicalGroup(1, [side], name=name)
-        gmsh.model.mesh.generate(2)
-    return tfeti.read_gmsh(model, COMM, subdomains=4)
+        model.mesh.generate(2)
+        return model
+
+    return torn(COMM, build, subdomains=4)
 
 
-def pin_in_sheet(size: float) -> tfeti.Decomposition:
-    """The upper half of NAFEMS' loaded pin, of curved triangles: "pin side", "bore", "clamp".
+def pin_in_sheet(size: float) -> Any:
+    """The upper half of NAFEMS' loaded pin: "pin side", "bore", "clamp".
 
     The surfaces on the plane of symmetry are "middle", the bodies "pin" and "sheet".
     """
-    model, (R, outer, length) = None, (50.0, 100.0, 200.0)
-    if COMM.rank == 0:
-        model = started_model("pin_in_sheet")
-        geo = model.geo
-        centre = geo.addPoint(0.0, 0.0, 0.0)
+    R, outer, length = 50.0, 100.0, 200.0
+    model = started_model("pin_in_sheet")
+    geo = model.geo
+    centre = geo.addPoint(0.0, 0.0, 0.0)
 
-        def point(x: float, y: float) -> int:
-            return int(geo.addPoint(x, y, 0.0))
+    def half_circle() -> tuple[list[int], list[int]]:
+        ends = [geo.addPoint(x, y, 0.0) for x, y in ((R, 0.0), (0.0, R), (-R, 0.0))]
+        return ends, [geo.addCircleArc(ends[k], centre, ends[k + 1]) for k in (0, 1)]
 
-        ends = point(R, 0.0), point(0.0, R), point(-R, 0.0)
-        arcs = [geo.addCircleArc(ends[k], centre, ends[k + 1]) for k in (0, 1)]
-        middle = [geo.addLine(ends[2], centre), geo.addLine(centre, ends[0])]
-        pin = geo.addPlaneSurface([geo.addCurveLoop([*arcs, *middle])])
-        ends = point(R, 0.0), point(0.0, R), point(-R, 0.0)
-        bore = [geo.addCircleArc(ends[k], centre, ends[k + 1]) for k in (0, 1)]
-        tip, top = point(outer, 0.0), point(0.0, outer)
-        corners = point(-length, outer), point(-length, 0.0)
-        sides = [geo.addLine(ends[0], tip), geo.addCircleArc(tip, centre, top)]
-        sides += [geo.addLine(top, corners[0]), geo.addLine(*corners)]
-        sides += [geo.addLine(corners[1], ends[2])]
-        loop = [*sides, -bore[1], -bore[0]]
-        sheet = geo.addPlaneSurface([geo.addCurveLoop(loop)])
-        for curves, share in ((arcs, 1.0), (bore, 0.8)):
-            for curve in curves:
-                count = round(np.pi / 2 * R / (share * size)) + 1
-                geo.mesh.setTransfiniteCurve(curve, count)
-        geo.synchronize()
-        model.mesh.setSize(model.getEntities(0), 3.0 * size)
-        for name, body in (("pin", pin), ("sheet", sheet)):
-            model.addPhysicalGroup(2, [body], name=name)
-        for name, tags in (
-            ("pin side", arcs),
-            ("bore", bore),
-            ("middle", [*middle, sides[0], sides[4]]),
-            ("clamp", [sides[3]]),
-        ):
-            model.addPhysicalGroup(1, tags, name=name)
-        with element_options(ElementOrder=2):
-            model.mesh.generate(2)
-    return tfeti.read_gmsh(model, COMM, subdomains=8)
+    ends, arcs = half_circle()
+    middle = [geo.addLine(ends[2], centre), geo.addLine(centre, ends[0])]
+    pin = geo.addPlaneSurface([geo.addCurveLoop([*arcs, *middle])])
+    ends, bore = half_circle()
+    places = (outer, 0.0), (0.0, outer), (-length, outer), (-length, 0.0)
+    tip, top, *corners = (geo.addPoint(x, y, 0.0) for x, y in places)
+    sides = [geo.addLine(ends[0], tip), geo.addCircleArc(tip, centre, top)]
+    sides += [geo.addLine(top, corners[0]), geo.addLine(*corners), geo.addLine(corners[1], ends[2])]
+    sheet = geo.addPlaneSurface([geo.addCurveLoop([*sides, -bore[1], -bore[0]])])
+    for curves, share in ((arcs, 1.0), (bore, 0.8)):
+        for curve in curves:
+            count = round(np.pi / 2 * R / (share * size)) + 1
+            geo.mesh.setTransfiniteCurve(curve, count)
+    geo.synchronize()
+    model.mesh.setSize(model.getEntities(0), 3.0 * size)
+    for name, body in (("pin", pin), ("sheet", sheet)):
+        model.addPhysicalGroup(2, [body], name=name)
+    surfaces = {"pin side": arcs, "bore": bore, "clamp": [sides[3]]}
+    surfaces["middle"] = [*middle, sides[0], sides[4]]
+    for name, tags in surfaces.items():
+        model.addPhysicalGroup(1, tags, name=name)
+    model.mesh.generate(2)
+    return model
 
 
 def contact_force(problem: tfeti.ContactProblem) -> float:
@@ -195,7 +184,8 @@ def point_contact(
         published: a, p₀, and what the source allows.
     """
     R, E, nu, down = ball
-    scene = Elastic(quarter_disc(R, *mesh), E, nu, "axisymmetric")
+    d = torn(COMM, lambda: quarter_disc(R, *mesh), subdomains=8)
+    scene = Elastic(d, E, nu, "axisymmetric")
     scene.hold("axis", 0)
     scene.hold("top", 1, -down)
     problem = scene.problem([tfeti.Obstacle("arc", partner[0], reach=4 * down)])
@@ -230,12 +220,9 @@ def steel_on_aluminium(scale: float) -> Iterator[Row]:
     R, P, nu = 50.0, 35e3, 0.3
     young = {"cylinder": 2.1e5, "block": 7e4}
     hertz = LineContact.from_load(P, R, 1 / sum((1 - nu**2) / E for E in young.values()))
-    model = None
-    if COMM.rank == 0:
-        a = hertz.half_width
-        sizes = {"fine": scale * a / 8, "fine_radius": 1.5 * a, "growth": 0.2}
-        model = cylinder_on_block.build(R, **sizes)
-    scene = Elastic(tfeti.read_gmsh(model, COMM, 8), young, nu, "plane_strain")
+    sizes = {"fine": scale * hertz.half_width / 8, "fine_radius": 1.5 * hertz.half_width}
+    d = torn(COMM, lambda: cylinder_on_block.build(R, **sizes, growth=0.2), 8)
+    scene = Elastic(d, young, nu, "plane_strain")
     scene.hold("axis", 0)
     scene.hold("bottom", 1)
     scene.load("load", scene.constant(0.0, -P / (2 * R)))
@@ -298,14 +285,12 @@ def concentric_rings(scale: float) -> Iterator[Row]:
 def patches(scale: float) -> Iterator[Row]:
     """Two blocks that do not match, ν = 0."""
     for gdim, E, down, pressure in ((2, 2e6, -0.1, 1e5), (3, 2e5, -0.2, 1e4)):
-        model = None
-        if COMM.rank == 0:
-            depth, height, n = (1.0, 1.0, 1) if gdim == 2 else (2.0, 2.0, 4)
-            size = (2.0, depth, height)
-            lower = blocks.Block("lower", (0, 0, 0), size, (5, n, 3))
-            upper = blocks.Block("upper", (0, 0, height), size, (7, max(n - 1, 1), 4))
-            model = blocks.build([lower, upper])
-        scene = Elastic(tfeti.read_gmsh(model, COMM, 4), E, 0.0, "3d")
+        depth, height, n = (1.0, 1.0, 1) if gdim == 2 else (2.0, 2.0, 4)
+        size = (2.0, depth, height)
+        lower = blocks.Block("lower", (0, 0, 0), size, (5, n, 3))
+        upper = blocks.Block("upper", (0, 0, height), size, (7, max(n - 1, 1), 4))
+        d = torn(COMM, partial(blocks.build, [lower, upper]), 4)
+        scene = Elastic(d, E, 0.0, "3d")
         for surface in ("lower bottom", "upper top"):  # nothing moves across, since ν = 0
             scene.hold(surface, 0)
             scene.hold(surface, 1)
@@ -351,7 +336,7 @@ def loaded_pin(scale: float) -> Iterator[Row]:
     """
     R, mu, line_load, found = 50.0, 0.1, 100e3 / 10.0, list[dict[str, float]]()
     for size in (1.5 * scale, 3.0 * scale):
-        d = pin_in_sheet(size)
+        d = torn(COMM, partial(pin_in_sheet, size), 8, order=2)
         scene = Elastic(d, {"pin": 2.1e5, "sheet": 7e4}, 0.3, "plane_stress", degree=2)
         for surface, axis in (("middle", 1), ("clamp", 0), ("clamp", 1)):
             scene.hold(surface, axis)

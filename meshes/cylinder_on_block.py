@@ -6,7 +6,7 @@ from typing import Any
 
 import gmsh
 
-from meshes.tools import graded_field, started_model, use_sizes
+from meshes.tools import graded_field, half_disc, started_model, use_sizes
 
 
 def build(
@@ -31,7 +31,7 @@ def build(
         coarser: How much larger the block's elements are.
     """
     model = started_model("cylinder_on_block")
-    cylinder, arcs, load, upper_axis = _half_disc(model.geo, radius)
+    cylinder, arcs, load, upper_axis = half_disc(model.geo, radius)
     blocks, top, bottom, lower_axis = _block(model.geo, block)
     model.geo.synchronize()
     model.addPhysicalGroup(2, cylinder, name="cylinder")
@@ -48,22 +48,6 @@ def build(
     )
     gmsh.model.mesh.generate(2)
     return model
-
-
-def _half_disc(geo: Any, radius: float) -> tuple[list[int], list[int], list[int], int]:
-    """Surfaces, arcs, flat top and axis."""
-    lowest, centre, right, left = (
-        geo.addPoint(x, y, 0.0)
-        for x, y in ((0.0, 0.0), (0.0, radius), (radius, radius), (-radius, radius))
-    )
-    axis = geo.addLine(lowest, centre)
-    arcs = [geo.addCircleArc(lowest, centre, right), geo.addCircleArc(left, centre, lowest)]
-    load = [geo.addLine(right, centre), geo.addLine(centre, left)]
-    halves = [
-        geo.addPlaneSurface([geo.addCurveLoop([arcs[0], load[0], -axis])]),
-        geo.addPlaneSurface([geo.addCurveLoop([axis, load[1], arcs[1]])]),
-    ]
-    return halves, arcs, load, axis
 
 
 def _block(geo: Any, b: float) -> tuple[list[int], list[int], list[int], int]:

@@ -14,7 +14,7 @@ import gmsh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from meshes.tools import graded_size, started_model
+from meshes.tools import graded_size, half_disc, started_model
 
 
 def build(
@@ -37,19 +37,8 @@ def build(
         partitions: Number of gmsh's partitions, 0 for none.
     """
     model = started_model("half_cylinder")
-    geo = model.geo
-    lowest = geo.addPoint(0.0, 0.0, 0.0)
-    centre = geo.addPoint(0.0, radius, 0.0)
-    right = geo.addPoint(radius, radius, 0.0)
-    left = geo.addPoint(-radius, radius, 0.0)
-    axis = geo.addLine(lowest, centre)
-    arcs = [geo.addCircleArc(lowest, centre, right), geo.addCircleArc(left, centre, lowest)]
-    top = [geo.addLine(right, centre), geo.addLine(centre, left)]
-    halves = [
-        geo.addPlaneSurface([geo.addCurveLoop([arcs[0], top[0], -axis])]),
-        geo.addPlaneSurface([geo.addCurveLoop([axis, top[1], arcs[1]])]),
-    ]
-    geo.synchronize()
+    halves, arcs, top, axis = half_disc(model.geo, radius)
+    model.geo.synchronize()
     model.addPhysicalGroup(2, halves, name="body")
     model.addPhysicalGroup(1, arcs, name="contact")
     model.addPhysicalGroup(1, top, name="top")

@@ -3,8 +3,7 @@
 import gmsh
 import numpy as np
 
-import tfeti_dolfinx as tfeti
-from meshes.tools import element_options, started_model
+from meshes.tools import started_model, torn
 
 CORE, PIN, EDGE = 4.0, 10.0, 20.0
 
@@ -41,14 +40,7 @@ def build(sizes, clearance=0.05, turn=0.1, thickness=0.0, layers=1, half=False):
 
 def lug(comm, sizes, order=1, *, subdomains=4, **options):
     """The pin and the lug, torn; ``options`` are those of ``build``."""
-    model = None
-    if comm.rank == 0:
-        with element_options(ElementOrder=order):
-            model = build(sizes, **options)
-    d = tfeti.read_gmsh(model, comm, subdomains)
-    if comm.rank == 0:
-        gmsh.model.remove()
-    return d
+    return torn(comm, lambda: build(sizes, **options), subdomains, order)
 
 
 def _body(radii, begin, parts, thickness, layers, sides):

@@ -3,8 +3,7 @@
 import gmsh
 import numpy as np
 
-import tfeti_dolfinx as tfeti
-from meshes.tools import element_options, started_model
+from meshes.tools import started_model, torn
 
 INNER, MIDDLE, OUTER = 0.5, 1.0, 1.6
 
@@ -41,14 +40,7 @@ def rings(comm, cells, order=1, *, subdomains=4, **options):
         subdomains: Their number.
         options: Further arguments of ``build``.
     """
-    model = None
-    if comm.rank == 0:
-        with element_options(ElementOrder=order):
-            model = build(cells, **options)
-    d = tfeti.read_gmsh(model, comm, subdomains)
-    if comm.rank == 0:
-        gmsh.model.remove()
-    return d
+    return torn(comm, lambda: build(cells, **options), subdomains, order)
 
 
 def _ring(name, radii, cells, turn, triangles):
