@@ -37,6 +37,7 @@ from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checke
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
+from tfeti_dolfinx.qp.problem import ConvergedReason
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.report import Outcome, Report, SolverCounts, added, largest_over_ranks
 from tfeti_dolfinx.saved_state import SavedState, check_state
@@ -295,7 +296,9 @@ class ContactProblem:
         # 3. what the report says of it
         counts = SolverCounts.of_run(dual, *solved)
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
-        excluding = system.search.named(gluing.contacts_of(result.excluding))
+        excluding = list[str]()
+        if result.reason == ConvergedReason.DIVERGED_CONTRADICTION:
+            excluding = system.search.named(gluing.contacts_of(result.excluding))
         state, loose = accuracy.recovered, list[dict[str, object]]()
         if options.warnings and state is not None:
             loose = dual.nearly_free(state.active)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -59,7 +60,7 @@ class Sizes:
             len(gluing.contact.decided),
             constraints.sets.tangents.size,
         )
-        rows, normals, candidates, far, dropped, tangents = comm.allreduce(np.array(own)).tolist()
+        rows, normals, candidates, far, dropped, tangents = map(int, summed(comm, np.array(own)))
         return cls(
             ranks=comm.size,
             primal_dofs=int(dofs.offsets[-1]) * dofs.bs - inside,
@@ -245,9 +246,9 @@ class Outcome:
             np.sum(solution.carrying[normals]),
             np.sum(status == ContactStatus.STICK),
             np.sum(status == ContactStatus.SLIP),
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
         )
-        kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        active, sticking, sliding = dual.coarse.comm.allreduce(np.array(own)).tolist()
+        active, sticking, sliding, kilobytes = map(int, summed(dual.coarse.comm, np.array(own)))
         return cls(
             contacts=ContactSummary.of_solution(solution),
             clusters=dual.subdomains.num_clusters,
@@ -263,7 +264,7 @@ class Outcome:
             friction_last=settling.last,
             local_operators=_local_operators(dual),
             converged_reason=result.reason.name,
-            peak_memory_mb=float(dual.coarse.comm.allreduce(kilobytes / 1024.0)),
+            peak_memory_mb=kilobytes / 1024.0,
             residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
             tolerances=_tolerances(solution, accuracy) | {"friction": settling.tolerance},
             estimates=estimates,
@@ -425,16 +426,16 @@ def largest_over_ranks(seconds: Mapping[str, float], comm: MPI.Intracomm) -> dic
 
 def _local_operators(dual: Dual) -> dict[str, float]:
     """Forms of the local operators, and what they cost."""
-    found: dict[str, float] = {}
-    comm = dual.coarse.comm
+    found, means = Counter[str](), dict[str, float]()
     for name, operator in (("F", dual.F), ("preconditioner", dual.preconditioner)):
         if operator is None or (own := getattr(operator.local, "forms", None)) is None:
             continue
-        forms = comm.allreduce(own)
-        found |= {f"{name}_{form}": float(forms[form]) for form in sorted(forms)}
-        mean = operator.seconds / max(operator.times, 1)
-        found[f"{name}_measured"] = comm.allreduce(mean, op=MPI.MAX)
-    return found
+        found.update({f"{name}_{form}": count for form, count in own.items()})
+        means[f"{name}_measured"] = operator.seconds / max(operator.times, 1)
+    seconds, comm = np.array(list(means.values())), dual.coarse.comm
+    comm.Allreduce(MPI.IN_PLACE, seconds, op=MPI.MAX)
+    forms = {name: float(count) for name, count in sorted(comm.allreduce(found).items())}
+    return forms | dict(zip(means, map(float, seconds), strict=True))
 
 
 def _residuals(

@@ -12,7 +12,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import stage
-from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
@@ -24,7 +24,7 @@ from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
-from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.assembly import Data, Forms
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
@@ -218,6 +218,11 @@ class System:
         self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
         self._known_friction: Array | None = None
         self._prescribed: Prescribed | None = None
+        self._conditions: list[fem.DirichletBC] | None = None  # that it is of, with their values
+        self._values = Data(
+            lambda: [bc.g.x.array if hasattr(bc.g, "x") else bc.g.value for bc in self.bcs],
+            dofs.comm,
+        )
         self._gluing: Gluing | None = None
         self._subdomains: Subdomains | None = None
         self._dual: tuple[Dual, Options] | None = None
@@ -256,12 +261,15 @@ class System:
         changes = self.forms.changes() | self.tools.read(self.time)
         for what in (name for name in CHANGES if name in changes):
             self.change(what)
-        comm, new, old = self._dofs.comm, prescribe(self._dofs, self.bcs), self._prescribed
-        self._prescribed = new
-        if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
-            self.change("constraints")
-        elif any_rank(comm, not np.array_equal(new.value, old.value)):
-            self.change("right side")
+        comm, given = self._dofs.comm, list(self.bcs)
+        if self._values.has_changed() or given != self._conditions:
+            self._conditions, old = None, self._prescribed  # what raises looks again
+            new = self._prescribed = prescribe(self._dofs, given)
+            if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
+                self.change("constraints")
+            elif any_rank(comm, not np.array_equal(new.value, old.value)):
+                self.change("right side")
+            self._conditions = given
         if self._search is not None and self._known_friction is not None:
             friction = self._search.friction()
             if any_rank(comm, not np.array_equal(friction, self._known_friction)):
@@ -349,7 +357,7 @@ class System:
         has_kernel = self._dual is None or self.dual.coarse.dimension > 0
         before, self._counted = self._counted, self._counters.factorizations
         return StageCounts(
-            factorizations=self._dofs.comm.allreduce(self._counted - before),
+            factorizations=int(summed(self._dofs.comm, np.array([self._counted - before]))[0]),
             coarse_factorizations=done["coarse problem"] if has_kernel else 0,
             assemblies=done["stiffness"],
             searches=done["search"],

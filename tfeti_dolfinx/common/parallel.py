@@ -35,7 +35,10 @@ def steering(comm: MPI.Intracomm, *values: float) -> Array:
 
 def any_rank(comm: MPI.Intracomm, flag: bool | Array) -> bool:
     """Return whether a flag, or an entry other than 0, is set on some rank. Collective."""
-    found = np.array([np.logical_or.reduce(flag, axis=None)], dtype=int)
+    own = flag.any() if isinstance(flag, np.ndarray) else flag
+    if comm.size == 1:
+        return bool(own)
+    found = np.array([own], dtype=int)
     comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
     return bool(found[0])
 

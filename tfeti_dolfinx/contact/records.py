@@ -90,6 +90,8 @@ class ContactRecords:
 
 def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     """All conditions of several contacts in one table."""
+    if len(records) == 1:
+        return records[0]
     starts = np.cumsum([0, *(len(r) for r in records)])
     moved = [replace(r, condition=r.condition + s) for r, s in zip(records, starts, strict=False)]
     shapes = {"frame": (0, gdim, gdim), "place": (0, gdim), "motion": (0, gdim)}

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
@@ -60,6 +60,8 @@ class ContactSearch:
         ]
         self.contacts = [contact for contact, _ in settled]
         self._records = [self._from_origin(records) for _, records in settled]
+        # beside the conditions that they were found with, some up to a larger reach
+        self._wide: dict[int, tuple[ContactRecords, ContactRecords, float]] = {}
 
     @property
     def records(self) -> ContactRecords:
@@ -125,19 +127,32 @@ class ContactSearch:
             moved = self._approach(contact, way.reshape(-1, self._dofs.bs))
             tried = [(self._records[i], self._reach[i])]
             if moved > self._reach[i]:
-                tried.insert(0, (self._search(i, moved), moved))
+                wide = self._far(i, moved)
+                if self._count(self._overlapping(wide, u, tolerance) & ~wide.within_reach):
+                    tried.insert(0, (self._search(i, moved), moved))
             for found, reach in tried:
-                there = found
-                if self._tools:
-                    there = replace(found, motion=self._tools.motion(found, found=True))
-                v = relative_displacement(there, self._dofs, u)
-                overlaps = found.gap - np.sum(found.normal * v, axis=1) < -tolerance
+                overlaps = self._overlapping(found, u, tolerance)
                 if new := self._count(overlaps & ~found.within_reach):
                     self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
                     self._reach[i] = reach
                     count += new
                     break
         return count
+
+    def _overlapping(self, found: ContactRecords, u: Array, tolerance: float) -> Array:
+        there = found
+        if self._tools:
+            there = replace(found, motion=self._tools.motion(found, found=True))
+        v = relative_displacement(there, self._dofs, u)
+        return np.asarray(found.gap - np.sum(found.normal * v, axis=1) < -tolerance)
+
+    def _far(self, i: int, moved: float) -> ContactRecords:
+        """Conditions up to twice a way at least, kept for the next ways while those near stay."""
+        known, found, reach = self._wide.get(i, (None, self._records[i], 0.0))
+        if known is not self._records[i] or reach < moved:
+            found, reach = self._search(i, 2.0 * moved), 2.0 * moved
+            self._wide[i] = self._records[i], found, reach
+        return found
 
     def widen(self) -> int:
         """Increase the reach until a condition gets a row, since far contact may hold a body.
@@ -164,7 +179,7 @@ class ContactSearch:
     def unmet(self) -> list[str]:
         """Contacts none of whose nodes has a row: position in the list, and name."""
         rows = np.array([np.sum(known.within_reach) for known in self._records], dtype=np.int64)
-        return self.named(np.flatnonzero(self._dofs.comm.allreduce(rows) == 0))
+        return self.named(np.flatnonzero(summed(self._dofs.comm, rows) == 0))
 
     def named(self, positions: Iterable[int] | Array) -> list[str]:
         """Contacts as reports name them: position in the list, and name."""
@@ -186,9 +201,10 @@ class ContactSearch:
         if len(contact.surfaces) == 1:
             return 0.0
         moved = [u[surface_nodes(dofs, cut.facets(name))] for name in contact.surfaces]
-        total = comm.allreduce(np.sum([part.sum(axis=0) for part in moved], axis=0))
-        mean = total / comm.allreduce(sum(len(part) for part in moved))
-        largest = np.array([np.linalg.norm(u - mean, axis=1).max(initial=0.0) for u in moved])
+        own = np.sum([np.append(part.sum(axis=0), len(part)) for part in moved], axis=0)
+        *total, count = summed(comm, own)
+        squares = [np.sum((u - np.divide(total, count)) ** 2, axis=1) for u in moved]
+        largest = np.sqrt([square.max(initial=0.0) for square in squares])
         comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         return bcast_from_root(comm, float(largest.sum()))
 
@@ -212,4 +228,4 @@ class ContactSearch:
         return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))
 
     def _count(self, flags: Array) -> int:
-        return int(self._dofs.comm.allreduce(int(np.sum(flags))))
+        return int(summed(self._dofs.comm, np.array([np.sum(flags)]))[0])

@@ -208,13 +208,10 @@ class Product:
 
     def __init__(self, factors: Sequence[tuple[slice | Array, FeasibleSet]] = ()) -> None:
         self.factors = [(_indices(rows), factor) for rows, factor in factors]
-        rows, count = np.unique(
-            np.concatenate([np.empty(0, dtype=np.int64), *(rows for rows, _ in self.factors)]),
-            return_counts=True,
-        )
-        if np.any(count > 1):
+        rows = [np.empty(0, dtype=np.int64), *(rows for rows, _ in self.factors)]
+        if np.any(twice := np.bincount(np.concatenate(rows)) > 1):
             raise InputError(
-                f"Product: constraint {rows[count > 1][0]} stands in two sets; expected one at most"
+                f"Product: constraint {np.argmax(twice)} stands in two sets; expected one at most"
             )
 
     def project(self, x: Array) -> Array:

@@ -21,7 +21,7 @@ from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.feti.dual import Dual, contact_set
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.elasticity import Modulus
 from tfeti_dolfinx.forms.newmark import InertialForms, check_copies, mass_form
@@ -30,7 +30,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.nonlinear.forms import InertialNewtonForms
 from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.qp.sets import Bounds, Ellipses, FeasibleSet, Product
+from tfeti_dolfinx.qp.sets import FeasibleSet
 from tfeti_dolfinx.saved_state import SavedState
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
@@ -55,20 +55,20 @@ def balance(
         at most 0; and ``defect``, what all these leave of the change of the energy: rounding.
     """
     inertia, motion = forms.inertia, forms.inertia.motion
-    M = inertia.M
     u, v = solution.dofs.to_dolfinx(solution.u), solution.v
     assert v is not None
     start, way = motion.start, u - motion.u
     kicked = motion.towards - motion.u - motion.size * start
     sets, primal = dual.constraints.sets, solution.dofs.to_primal(way)
     done = -solution.lam * dual.constraints.jumps(primal[dual.subdomains.trace])  # −λᵀB Δu
+    M, moving = inertia.M, motion.v @ (inertia.M @ motion.v)
     own = [
         0.5 * v @ (M @ v),
         forms.elastic(u),
-        0.5 * motion.v @ (M @ motion.v) + forms.elastic(motion.u),
+        0.5 * moving + forms.elastic(motion.u),
         0.5 * (motion.load + inertia.ends) @ way,
         *(done[rows].sum() for rows in (sets.normals, sets.tangents.ravel(), sets.equalities)),
-        0.5 * (start @ (M @ start) - motion.v @ (M @ motion.v))
+        (0.0 if start is motion.v else 0.5 * (start @ (M @ start) - moving))
         - 2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
     ]
     values = [float(value) for value in summed(solution.dofs.comm, np.array(own))]
@@ -190,9 +190,7 @@ class Predictor:
 
 def _frictionless(constraints: Constraints) -> FeasibleSet:
     """λ_N ≥ 0, and no force along tangents."""
-    sets = constraints.sets
-    none = Ellipses(np.zeros(sets.tangents.shape))
-    return Product([(sets.normals, Bounds()), (sets.tangents.ravel(), none)])
+    return contact_set(replace(constraints, limits=0.0 * constraints.limits))
 
 
 # --- Newmark's method with contact ------------------------------------------------------------

@@ -21,6 +21,7 @@ from tfeti_dolfinx.common.agreement import agreeing, check_same_problem
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.files import checked_path, written_whole
+from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.common.validation import (
     checked_callable,
     checked_flag,
@@ -371,7 +372,7 @@ class LoadSteps:
 
     def _record(self, number: int, t: float, size: float) -> StepRecord:
         report, solution = self._problem.report, self._problem.solution
-        lost = self._comm.allreduce(float(np.sum(solution.dissipation)))
+        lost = float(summed(self._comm, np.array([np.sum(solution.dissipation)]))[0])
         forces: list[Any] = report.contact_forces  # of bodies with mass they have blows, too
         if not forces:
             which = range(len(solution.contacts))

@@ -179,24 +179,22 @@ def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
     return out
 
 
-def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -> Array:
-    """K⁺ b of all Blocks, shape ``(n,)``; of equal ones with several right sides at once."""
-    x = np.empty(len(b))
-    members: dict[int, list[tuple[SparseBlock, slice]]] = defaultdict(list)
+def solves_of(
+    blocks: Sequence[Block], parts: Sequence[slice]
+) -> list[tuple[Callable[[Array], Array], Array]]:
+    """K⁺ of all Blocks with its unknowns among the rank's, a column for each of equal ones."""
+    found: list[tuple[Callable[[Array], Array], Array]] = []
+    members: dict[int, list[tuple[SparseBlock, Array]]] = defaultdict(list)
     for block, part in zip(blocks, parts, strict=True):
+        dofs = np.arange(part.start, part.stop)
         if isinstance(block, SparseBlock):
-            members[id(block.stiffness)].append((block, part))
+            members[id(block.stiffness)].append((block, dofs[np.argsort(block.place)]))
         else:
-            x[part] = block.solve(b[part])
+            found.append((block.solve, dofs))
     for equal in members.values():
-        stiffness = equal[0][0].stiffness
-        columns = np.empty((stiffness.size, len(equal)), order="F")
-        for j, (block, part) in enumerate(equal):
-            columns[block.place, j] = b[part]
-        columns = _in_chunks(stiffness.solve, columns)
-        for j, (block, part) in enumerate(equal):
-            x[part] = columns[block.place, j]
-    return x
+        solve = partial(_in_chunks, equal[0][0].stiffness.solve)
+        found.append((solve, np.stack([dofs for _, dofs in equal], axis=1)))
+    return found
 
 
 # --- Local operators of all subdomains of a rank ----------------------------------------------

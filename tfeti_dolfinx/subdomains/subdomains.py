@@ -30,7 +30,7 @@ from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
     LocalChoice,
     LocalOperator,
-    solved_together,
+    solves_of,
 )
 
 # --- Motions of subdomains that springs hold --------------------------------------------------
@@ -131,6 +131,7 @@ class Subdomains:
         self.size = sum(len(block.load) for block in self.blocks)
         self._read_trace()
         self._pinv_load: Array | None = None
+        self._solves: list[tuple[Callable[[Array], Array], Array]] | None = None
 
     def _read_trace(self) -> None:
         traces = [block.trace_dofs for block in self.blocks]
@@ -268,7 +269,12 @@ class Subdomains:
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shape ``(n,)``."""
-        return solved_together(self.blocks, self.dof_parts, b)
+        if self._solves is None:
+            self._solves = solves_of(self.blocks, self.dof_parts)
+        x = np.empty(len(b))
+        for solve, dofs in self._solves:
+            x[dofs] = solve(b[dofs])
+        return x
 
     @property
     def pinv_load(self) -> Array:
