@@ -65,7 +65,9 @@ def test_the_face_of_a_product_says_what_each_row_does():
 
 
 def test_a_row_in_two_sets_is_named():
-    with pytest.raises(InputError, match="Product: row 4 stands in two sets; expected one at most"):
+    with pytest.raises(
+        InputError, match="Product: constraint 4 stands in two sets; expected one at most"
+    ):
         Product([(slice(0, 5), Bounds()), (np.array([7, 4]), Bounds())])
 
 
