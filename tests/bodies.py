@@ -5,7 +5,7 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import hooke, strain
+from scenes import hooke, strain, tagged, vectors
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.compat import geometry_dofmap
@@ -29,11 +29,9 @@ def boxes(cell, parts, comm=MPI.COMM_WORLD):
     cell_type = dmesh.to_type(cell)
     gdim = len(parts[0][1])
     cells, points, start = [], [], 0
+    make = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
     for _, low, high, n in parts:
-        if gdim == 2:
-            box = dmesh.create_rectangle(MPI.COMM_SELF, [low, high], list(n), cell_type)
-        else:
-            box = dmesh.create_box(MPI.COMM_SELF, [low, high], list(n), cell_type)
+        box = make(MPI.COMM_SELF, [low, high], list(n), cell_type)
         cells.append(start + geometry_dofmap(box))
         points.append(box.geometry.x[:, :gdim])
         start += len(box.geometry.x)
@@ -42,41 +40,7 @@ def boxes(cell, parts, comm=MPI.COMM_WORLD):
     if comm.rank:
         cells, points = cells[:0], points[:0]
     mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element)
-    return mesh, *_tags(mesh, parts, gdim)
-
-
-def _tags(mesh, parts, gdim):
-    sides = [("left", 0, 0), ("right", 0, 1), ("bottom", gdim - 1, 0), ("top", gdim - 1, 1)]
-    if gdim == 3:
-        sides += [("front", 1, 0), ("back", 1, 1)]
-    names, facets, values = {}, [], []
-    for name, low, high, _ in parts:
-        for side, axis, end in sides:
-            tag = names[f"{name} {side}"] = len(names) + 1
-            at = (low, high)[end][axis]
-
-            def on_side(x, axis=axis, at=at, low=low, high=high):
-                inside = np.isclose(x[axis], at, atol=1e-9)
-                for k in range(gdim):
-                    inside &= (x[k] > low[k] - 1e-9) & (x[k] < high[k] + 1e-9)
-                return inside
-
-            found = dmesh.locate_entities_boundary(mesh, gdim - 1, on_side)
-            # a coincident side of another box is told apart by the cell's midpoint
-            found = found[_belongs(mesh, found, low, high, gdim)]
-            facets.append(found)
-            values.append(np.full(len(found), tag, dtype=np.int32))
-    facets, values = np.concatenate(facets), np.concatenate(values)
-    order = np.argsort(facets)
-    return dmesh.meshtags(mesh, gdim - 1, facets[order], values[order]), names
-
-
-def _belongs(mesh, facets, low, high, gdim):
-    mesh.topology.create_connectivity(gdim - 1, gdim)
-    links = mesh.topology.connectivity(gdim - 1, gdim)
-    cells = np.array([links.links(f)[0] for f in facets], dtype=np.int32)
-    middle = dmesh.compute_midpoints(mesh, gdim, cells)[:, :gdim]
-    return np.all((middle > np.array(low)) & (middle < np.array(high)), axis=1)
+    return mesh, *tagged(mesh, parts)
 
 
 def stacked(cell, n_lower=3, n_upper=4, subdomains=4, upper=(0.0, 1.0), gap=0.0):
@@ -103,15 +67,11 @@ def jagged(x):
 
 def two_body_problem(d, load, bcs, contacts, degree=1, stress=None, **options):
     """Elasticity with a load given as a linear form of the test function."""
-    gdim = d.mesh.geometry.dim
-    V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    V, u, v = vectors(d, degree)
     stress = stress or hooke()
-    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * degree})
-    ds = ufl.Measure(
-        "ds", domain=d.mesh, subdomain_data=d.facet_tags, metadata={"quadrature_degree": 2 * degree}
-    )
-    a = ufl.inner(stress(u), strain(v)) * dx
+    exact = {"domain": d.mesh, "metadata": {"quadrature_degree": 2 * degree}}
+    ds = ufl.Measure("ds", subdomain_data=d.facet_tags, **exact)
+    a = ufl.inner(stress(u), strain(v)) * ufl.Measure("dx", **exact)
     return tfeti.ContactProblem(
         a, load(v, ds), bcs(V), contacts, d, stress=stress, petsc_options=options
     )

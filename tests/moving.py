@@ -4,7 +4,7 @@ import numpy as np
 import ufl
 from bodies import stacked
 from dolfinx import fem
-from scenes import decomposed, hooke, strain
+from scenes import accepted, decomposed, hooke, strain, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -48,8 +48,7 @@ class Thrown:
     ):
         d = stacked(cell, 2, 3, 4, gap=gap) if below else decomposed(cell, n, subdomains)
         self.gdim = gdim = d.mesh.geometry.dim
-        V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        V, u, v = vectors(d)
         self.weight = fem.Constant(d.mesh, -weight * np.eye(gdim)[-1])
         velocity = fem.Function(V)
         velocity.interpolate(
@@ -82,7 +81,6 @@ class Thrown:
         found = []
         self.problem.take_step(size)
         for _ in range(count):
-            self.problem.solve()
-            self.problem.accept()
+            accepted(self.problem)
             found.append((dict(self.problem.report.motion), self.problem.report.contact_forces))
         return found

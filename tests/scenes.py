@@ -14,26 +14,36 @@ SIDES_3D = {**SIDES_2D, "bottom": (2, 0.0), "top": (2, 1.0), "front": (1, 0.0), 
 SIDES = {2: SIDES_2D, 3: SIDES_3D}
 
 
+def tagged(mesh, parts):
+    """Facet tags of boxes and their names: "<box> left", "right", "bottom", "top", "front", ..."""
+    gdim = mesh.geometry.dim
+    mesh.topology.create_connectivity(gdim - 1, gdim)
+    facets = dmesh.exterior_facet_indices(mesh.topology)
+    links = mesh.topology.connectivity(gdim - 1, gdim)
+    cells = np.array([links.links(f)[0] for f in facets], dtype=np.int32)
+    at, beside = (
+        dmesh.compute_midpoints(mesh, dim, entities)[:, :gdim]
+        for dim, entities in ((gdim - 1, facets), (gdim, cells))
+    )
+    values, names = np.zeros(len(facets), dtype=np.int32), {}
+    for name, low, high, *_ in parts:
+        own = np.all((beside > np.array(low)) & (beside < np.array(high)), axis=1)
+        for side, (axis, end) in SIDES[gdim].items():
+            tag = names[f"{name} {side}".strip()] = len(names) + 1
+            values[own & np.isclose(at[:, axis], (low, high)[int(end)][axis], atol=1e-9)] = tag
+    return dmesh.meshtags(mesh, gdim - 1, facets, values), names
+
+
 def box(cell="hexahedron", n=3, comm=MPI.COMM_WORLD, degree_of_grading=1.0):
     """Unit square or cube, with its sides tagged 1, 2, ... in the order of SIDES."""
     cell_type = dmesh.to_type(cell)
     gdim = 2 if cell in ("triangle", "quadrilateral") else 3
-    if gdim == 2:
-        mesh = dmesh.create_rectangle(comm, [(0, 0), (1, 1)], [n, n], cell_type)
-    else:
-        mesh = dmesh.create_box(comm, [(0, 0, 0), (1, 1, 1)], [n] * 3, cell_type)
-    names = {name: tag for tag, name in enumerate(SIDES[gdim], start=1)}
-    facets, values = [], []
-    for name, (axis, at) in SIDES[gdim].items():
-        found = dmesh.locate_entities_boundary(
-            mesh, gdim - 1, lambda x, axis=axis, at=at: np.isclose(x[axis], at)
-        )
-        facets.append(found)
-        values.append(np.full(len(found), names[name], dtype=np.int32))
-    facets, values = np.concatenate(facets), np.concatenate(values)
-    order = np.argsort(facets)
+    low, high = (0.0,) * gdim, (1.0,) * gdim
+    make = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
+    mesh = make(comm, [low, high], [n] * gdim, cell_type)
+    tags, names = tagged(mesh, [("", low, high)])
     mesh.geometry.x[:] **= degree_of_grading
-    return mesh, dmesh.meshtags(mesh, gdim - 1, facets[order], values[order]), names
+    return mesh, tags, names
 
 
 def decomposed(cell="hexahedron", n=3, subdomains=4, comm=MPI.COMM_WORLD, grading=1.0):
@@ -60,18 +70,11 @@ def hooke(E=1.0, nu=0.3):
 
 def forms(mesh, facet_tags, traction, top, degree=1, stress=None):
     """V, a, L of elasticity with a traction on the surface of a tag."""
-    gdim = mesh.geometry.dim
-    stress = stress or hooke()
-    V = fem.functionspace(mesh, ("Lagrange", degree, (gdim,)))
+    V = fem.functionspace(mesh, ("Lagrange", degree, (mesh.geometry.dim,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
-    ds = ufl.Measure(
-        "ds",
-        domain=mesh,
-        subdomain_data=facet_tags,
-        metadata={"quadrature_degree": 2 * degree},
-    )
-    a = ufl.inner(stress(u), strain(v)) * dx
+    exact = {"domain": mesh, "metadata": {"quadrature_degree": 2 * degree}}
+    a = ufl.inner((stress or hooke())(u), strain(v)) * ufl.Measure("dx", **exact)
+    ds = ufl.Measure("ds", subdomain_data=facet_tags, **exact)
     return V, a, ufl.dot(fem.Constant(mesh, np.array(traction, dtype=float)), v) * ds(top)
 
 
@@ -96,30 +99,16 @@ def problem(
     **options,
 ):
     """A box, some sides clamped, springs in each of its points, a traction on another side."""
-    gdim = decomposition.mesh.geometry.dim
-    traction = traction or (0.0,) * (gdim - 1) + (-0.05,)
-    V, a, L = forms(
-        decomposition.mesh,
-        decomposition.facet_tags,
-        traction,
-        decomposition.surface(loaded),
-        degree,
-    )
+    d = decomposition
+    traction = traction or (0.0,) * (d.mesh.geometry.dim - 1) + (-0.05,)
+    V, a, L = forms(d.mesh, d.facet_tags, traction, d.surface(loaded), degree)
     if springs:
         v, u = a.arguments()
-        dx = ufl.Measure("dx", domain=decomposition.mesh, metadata={"quadrature_degree": 2})
-        a += fem.Constant(decomposition.mesh, springs) * ufl.dot(u, v) * dx
-    bcs = [clamp(V, decomposition.facets(name)) for name in clamped]
-    return tfeti.ContactProblem(
-        a,
-        L,
-        bcs,
-        list(contacts),
-        decomposition,
-        stress=hooke(),
-        petsc_options=options,
-        extensions=extensions,
-    )
+        dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2})
+        a += fem.Constant(d.mesh, springs) * ufl.dot(u, v) * dx
+    bcs = [clamp(V, d.facets(name)) for name in clamped]
+    given = {"stress": hooke(), "petsc_options": options, "extensions": extensions}
+    return tfeti.ContactProblem(a, L, bcs, list(contacts), d, **given)
 
 
 def curved_obstacle(gdim, gap=0.02):
@@ -161,3 +150,45 @@ def displacement(problem):
 
 def relative(a, b):
     return np.linalg.norm(a - b) / np.linalg.norm(b)
+
+
+def largest(values):
+    """The largest absolute value of all ranks."""
+    return MPI.COMM_WORLD.allreduce(float(np.abs(values).max(initial=0.0)), op=MPI.MAX)
+
+
+def apart(u, other):
+    """Largest difference over the largest value, of all ranks."""
+    return largest(u - other) / largest(other)
+
+
+def integral(form):
+    """A form without arguments over the parts of all ranks."""
+    return MPI.COMM_WORLD.allreduce(fem.assemble_scalar(fem.form(form)))
+
+
+def measures(d):
+    """Measures of cells and facets with their tags."""
+    return (
+        ufl.Measure("dx", domain=d.mesh, subdomain_data=d.cell_tags),
+        ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags),
+    )
+
+
+def vectors(d, degree=1):
+    """A space of displacements, its trial and its test function."""
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (d.mesh.geometry.dim,)))
+    return V, ufl.TrialFunction(V), ufl.TestFunction(V)
+
+
+def unknowns(d, degree=1):
+    """The same with a function that is to be found: space, function, test and trial function."""
+    V, u, v = vectors(d, degree)
+    return V, fem.Function(V), v, u
+
+
+def accepted(problem):
+    """Solve and accept; the report."""
+    problem.solve()
+    problem.accept()
+    return problem.report

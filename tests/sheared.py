@@ -4,7 +4,7 @@ import numpy as np
 import ufl
 from bodies import drawn, two_body_problem
 from dolfinx import fem
-from scenes import clamp, curved_obstacle, decomposed, hooke, strain
+from scenes import clamp, curved_obstacle, decomposed, hooke, strain, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -31,8 +31,7 @@ class Sheared:
         d = decomposed(cell, n, subdomains)
         gdim = d.mesh.geometry.dim
         last, fdim = gdim - 1, gdim - 1
-        V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        V, u, v = vectors(d)
         self.top = fem.Constant(d.mesh, 0.0)
         W, _ = V.sub(last).collapse()
         down = fem.Function(W)

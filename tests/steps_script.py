@@ -13,7 +13,7 @@ from bodies import held, stacked
 from dolfinx import fem
 from moving import Thrown
 from mpi4py import MPI
-from scenes import displacement, hooke, strain
+from scenes import displacement, hooke, strain, vectors
 from sheared import Driven
 from test_nonlinear import plastic
 
@@ -86,8 +86,7 @@ class Apart:
 
     def __init__(self):
         d = stacked("quadrilateral", 3, 4, 2, gap=0.5)
-        V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        V, u, v = vectors(d)
         self.load = fem.Constant(d.mesh, (0.0, 0.0))
         a = ufl.inner(hooke()(u), strain(v)) * ufl.dx + ufl.dot(u, v) * ufl.dx
         L = ufl.dot(self.load, v) * ufl.dx

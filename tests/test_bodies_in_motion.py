@@ -5,7 +5,7 @@ import pytest
 import ufl
 from bodies import boxes
 from dolfinx import fem
-from scenes import hooke, strain
+from scenes import accepted, hooke, strain, vectors
 from scipy.optimize import lsq_linear
 
 import tfeti_dolfinx as tfeti
@@ -20,8 +20,7 @@ def falling(cell, degree, gap, stabilised, weight):
         low += height
     mesh, tags, names = boxes(cell, parts)
     d = tfeti.decompose(mesh, 7, facet_tags=tags, surfaces=names)
-    V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    V, u, v = vectors(d, degree)
     down = fem.Constant(d.mesh, (0.0, -weight))
     thrown = fem.Function(V)
     thrown.interpolate(lambda x: np.stack((0.1 * x[1], -0.3 * x[1] + 0.05 * (x[0] - 0.5))))
@@ -89,8 +88,7 @@ def test_three_bodies_move_as_dense_matrices_say(serial_only, case):
     K, M = forms.K.toarray(), forms.inertia.M.toarray()
     problem.take_step(tau)
     for _ in range(8):
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         towards, bounds = u + tau * v, rows(problem)
         if stabilised:
             towards = least(M, M @ towards, *bounds)

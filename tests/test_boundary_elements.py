@@ -4,7 +4,7 @@ import dolfinx
 import numpy as np
 import pytest
 import ufl
-from bodies import held
+from bodies import drawn, held
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from panels import kelvin
@@ -17,6 +17,7 @@ from scenes import (
     displacement,
     forms,
     hooke,
+    measures,
     relative,
 )
 
@@ -103,18 +104,10 @@ STRETCH = np.array([0.1, -0.1 * 0.3 / 0.7])
 def tension(d, elements, t=None):
     """Two volumes under uniaxial tension, solved; given t, it can be changed afterwards."""
     V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
     t = fem.Constant(d.mesh, (0.1 / (1 - 0.3**2), 0.0)) if t is None else t
-    p = tfeti.ContactProblem(
-        a,
-        ufl.dot(t, ufl.TestFunction(V)) * ds(d.surface("right")),
-        held(d, "left", "bottom")(V),
-        [],
-        d,
-        stress=hooke(),
-        petsc_options={"tfeti_rtol": 1e-10},
-        boundary_elements=elements,
-    )
+    L, given = drawn(d, "right", t)(ufl.TestFunction(V), measures(d)[1]), held(d, "left", "bottom")
+    more = {"stress": hooke(), "petsc_options": {"rtol": 1e-10}, "boundary_elements": elements}
+    p = tfeti.ContactProblem(a, L, given(V), [], d, **more)
     p.solve()
     return p
 
@@ -139,15 +132,12 @@ def test_constant_stresses_are_exact_in_space():
 def two_volumes(cell="triangle", n=4):
     """A square or cube of two volumes, each two subdomains."""
     mesh, facet_tags, names = box(cell, n)
-    tdim = mesh.topology.dim
-    cells = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
-    high = (dmesh.compute_midpoints(mesh, tdim, cells)[:, tdim - 1] > 0.5).astype(np.int32)
+    up = mesh.topology.dim - 1
     return tfeti.decompose(
         mesh,
-        lambda x: (x[0] > 0.5) + 2 * (x[tdim - 1] > 0.5),
-        cell_tags=dmesh.meshtags(mesh, tdim, cells, 1 + high),
+        lambda x: (x[0] > 0.5) + 2 * (x[up] > 0.5),
         facet_tags=facet_tags,
-        volumes={"low": 1, "high": 2},
+        volumes={"low": lambda x: x[up] <= 0.5, "high": lambda x: x[up] >= 0.5},
         surfaces=names,
     )
 

@@ -5,7 +5,7 @@ import pytest
 import ufl
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
-from scenes import clamp, curved_obstacle, decomposed, forms, hooke, strain
+from scenes import apart, clamp, curved_obstacle, decomposed, forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, Saddle
@@ -45,13 +45,6 @@ def solved(problem):
     u, report = problem.solution.u, problem.report
     problem.destroy()
     return u, report
-
-
-def difference(u, v):
-    """Largest difference over the largest displacement, over all ranks."""
-    parts = (np.abs(u - v).max(initial=0.0), np.abs(v).max(initial=0.0))
-    most, size = (COMM.allreduce(part, op=MPI.MAX) for part in parts)
-    return most / size
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +96,7 @@ def test_kernels_are_those_of_whole_clusters(clustered):
 def test_the_answer_is_the_same(clusters, options):
     u, plain = solved(square(8, 4, rtol=1e-9, **options))
     v, report = solved(square(8, 4, rtol=1e-9, clusters=clusters, **options))
-    assert difference(v, u) <= 1e-7
+    assert apart(v, u) <= 1e-7
     assert report.converged_reason == "CONVERGED_RTOL"
     assert report.kernel_dim <= plain.kernel_dim
 
@@ -120,7 +113,7 @@ def test_two_bodies():
     u, _ = solved(problem())
     v, report = solved(problem(clusters=2))
     assert 2 <= report.clusters < report.subdomains
-    assert difference(v, u) <= 1e-7
+    assert apart(v, u) <= 1e-7
 
 
 def test_a_new_stiffness():
@@ -135,7 +128,7 @@ def test_a_new_stiffness():
         p.solve()
         found.append(p.solution.u.copy())
         p.destroy()
-    assert difference(*found) <= 1e-7
+    assert apart(*found) <= 1e-7
 
 
 def test_more_clusters_than_subdomains():

@@ -16,8 +16,8 @@ def below(distance, **changes):
 
 @pytest.mark.parametrize("distance", [0.1, 1e6])
 def test_an_obstacle_that_is_never_touched_changes_nothing(distance):
-    without = problem(decomposed("quadrilateral", 6), (0.0, -1e-3))
-    with_it = problem(decomposed("quadrilateral", 6), (0.0, -1e-3), [below(distance)])
+    d = decomposed("quadrilateral", 6)
+    without, with_it = (problem(d, (0.0, -1e-3), some) for some in ([], [below(distance)]))
     without.solve()
     with_it.solve()
     assert with_it.report.contact_rows == 0

@@ -1,8 +1,8 @@
-"""What demos find at their quick size: closed forms, forces in balance, the laws of friction."""
+"""What demos find: closed forms, forces in balance, the laws of friction."""
 
 import numpy as np
 import pytest
-from mpi4py import MPI
+from scenes import largest
 
 import demos
 import tfeti_dolfinx as tfeti
@@ -11,6 +11,115 @@ BOUND = 0.008  # of the friction of four bodies
 PAIRS = ("wedge left", "wedge right", "left bottom", "right bottom")
 BOLTS = 4 * 30e3  # of both clamps
 BARS = [f"{side} bar {i}" for i in (1, 2) for side in ("lower", "upper")]
+
+
+PEAK = ("half_width", "peak_pressure")
+SLIP = {"half_width": 0.05, "stick_half_width": 0.05}
+LOOP = {"stick_half_width": 0.05, "stick_after_turns": 0.05, "dissipation": 0.05}
+LOOP["least_dissipation"] = (-1e-6, np.inf)  # of what a cycle loses
+
+
+def hertz(force, others):
+    return {"force": force, **dict.fromkeys(PEAK, others)}
+
+
+def partial_slip(others, friction):
+    """Of meshes and loads that are mirror images: pressing makes no friction."""
+    found = {"half_width": others, "stick_half_width": others, "traction_l2": friction}
+    return found | {
+        "friction_without_force": 1e-5,
+        "force": 1e-6,
+        "friction_force": 1e-6,
+        "law": 1e-3,
+    }
+
+
+def impact(name, **bounds):
+    return {f"{name}_{key}": bound for key, bound in bounds.items()}
+
+
+# largest errors at the quick size, or least and largest ones
+QUICK = {
+    "ball_bearing_3d": {"ball_balance": 1e-5, "force": 1e-5, "side_force": 0.02},
+    "belt_2d": {"capstan": 0.01, "capstan_hung": 0.01, "capstan_thin": 0.01},
+    "bolted_joint_3d": {
+        "slip_of_plates": 1e-3,
+        "slip_of_joint": 5e-3,
+        "pretension_of_springs": 0.2,  # springs of handbooks are a rough guide
+    },
+    "bouncing_bar": {"first_begin": 0.01, "first_end": 0.03, "first_pressure": 0.01},
+    "cattaneo_mindlin_2d": partial_slip(0.03, 0.03),
+    "clamped_connection_3d": {"force": 1e-5},
+    "deep_drawing_2d": {
+        "balance_of_tools": 1e-4,
+        "balance_of_work": 0.25,  # two steps: the work is a rough sum
+        "springback_degrees": (0.5, 3.0),
+    },
+    "four_bodies_2d": {"force_wedge": 1e-5, "force_base": 1e-5},
+    "hertz_2d": hertz(1e-4, 0.02),
+    "hertz_3d": hertz(1e-4, 0.05),
+    "impact_of_bars": impact(
+        "two", pressure=0.01, duration=0.01, oscillates=0.01, velocity=0.03, energy=0.02
+    ),
+    # the die piles the slab up before it
+    "ironing_3d": {"balance": 1e-3, "force_along_over_force_down": (0.3, 0.4)},
+    "mindlin_3d": partial_slip(0.15, 0.25),
+    "sphere_on_block_3d": hertz(1e-4, 0.05),
+    "stacked_blocks_3d": {"force_base": 1e-5},
+    "unloading_2d": LOOP,
+}
+TIGHT = ["-tfeti_rtol", "1e-8"]
+# the same with arguments
+OTHERS = [
+    ("cylinder_on_block_2d", TIGHT, hertz(1e-8, 0.03)),
+    ("cylinder_on_block_2d", ["--exchange", *TIGHT], hertz(1e-8, 0.03)),
+    # half planes against squares whose width is 7 half widths: bodies differ by percents
+    ("talk_hertz_2d", TIGHT, hertz(1e-6, 0.03)),
+]
+SLOW = [
+    ("belt_2d", [], {"capstan": 1e-3, "capstan_hung": 1e-3}),
+    ("cattaneo_mindlin_2d", ["--refine", 2], {"half_width": 0.01, "stick_half_width": 0.01}),
+    ("hertz_2d", TIGHT, hertz(1e-6, 0.02)),
+    ("hertz_3d", TIGHT, hertz(1e-6, 0.05)),
+    ("mindlin_3d", [], SLIP),
+    ("unloading_2d", [], {**LOOP, "dissipation": 0.01}),
+    # a contact that is small beside the ball, a/R = 0.056, and smooth
+    (
+        "falling_balls_3d",
+        ["--balls=1", "--modulus=4e7", "--fine=0.015", "--gap=0.01", "--end=0.01"]
+        + ["--steps=30", "--smooth"],
+        {"force": 0.05, "duration": 0.05},
+    ),
+]
+for name, steps in (("two", 80), ("clamped", 160), ("wall", 80)):  # a step of duration
+    bounds = impact(
+        name, pressure=0.01, duration=1.01 / steps, oscillates=0.005, energy=(-0.02, 0.0)
+    )
+    SLOW.append(("impact_of_bars", ["--impact", name, "--cells", 40], bounds))
+OTHERS += [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW]
+
+
+def check(errors, bounds):
+    for name, bound in bounds.items():
+        low, high = bound if isinstance(bound, tuple) else (-bound, bound)
+        assert low <= errors[name] <= high, name
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_errors_at_the_quick_size(quick_demo, name):
+    check(quick_demo(name).report["errors"], QUICK[name])
+
+
+@pytest.mark.parametrize(("name", "arguments", "bounds"), OTHERS)
+def test_errors_at_other_sizes(name, arguments, bounds):
+    check(demos.run(name, arguments)[1].errors, bounds)
+
+
+def test_the_energy_defect_of_a_loop_halves_with_the_step(quick_demo):
+    one = quick_demo("unloading_2d").report["errors"]
+    _, report = demos.run("unloading_2d", ["--quick", "--steps", 2])
+    check(report.errors, LOOP)
+    assert abs(report.errors["energy_defect"]) <= 0.5 * abs(one["energy_defect"])
 
 
 def check_friction(data, bound):
@@ -26,9 +135,6 @@ def test_forces_balance_and_the_lower_balls_carry_the_load(quick_demo):
     """Stribeck: the lowest of Z balls carries about 4.37/Z of the load, 5/Z with clearance."""
     bearing = quick_demo("ball_bearing_3d")
     assert bearing.report["bodies"] == 10
-    assert bearing.report["errors"]["ball_balance"] <= 1e-5
-    assert abs(bearing.report["errors"]["force"]) <= 1e-5
-    assert bearing.report["errors"]["side_force"] <= 0.02
     forces = [bearing.solution.contact(i).resultant.force for i in range(16)]
     inner, outer = np.linalg.norm(np.reshape(forces, (8, 2, 3)), axis=2).T / 2500.0
     assert 4.3 / 8 < inner[0] < 5 / 8
@@ -50,8 +156,6 @@ def test_partitions_keep_the_names(quick_demo):
 def test_the_capstan_equation_holds_and_all_of_the_belt_slips_back(quick_demo, comm):
     belt = quick_demo("belt_2d")
     data, report = belt.solution.contact("belt"), belt.report
-    for name in ("capstan", "capstan_hung", "capstan_thin"):
-        assert abs(report["errors"][name]) <= 0.01
     rubbing = data.status != tfeti.ContactStatus.OPEN
     # from the held side on the right to the pulled one: the way in which the belt slips
     along = np.stack((-data.points[:, 1], data.points[:, 0]), axis=1)
@@ -61,18 +165,10 @@ def test_the_capstan_equation_holds_and_all_of_the_belt_slips_back(quick_demo, c
     assert np.all(np.sum(data.tangential_traction * along, axis=1)[rubbing] > 0.0)
 
 
-@pytest.mark.slow
-def test_the_error_falls_with_the_mesh():
-    _, report = demos.run("belt_2d")
-    assert abs(report.errors["capstan"]) <= 0.001
-    assert abs(report.errors["capstan_hung"]) <= 0.001
-
-
 def test_friction_holds_the_load_and_the_bolts_press(quick_demo, comm):
     found = quick_demo("clamped_connection_3d")
     solution, report = found.solution, found.report
     assert report["bodies"] == 6
-    assert abs(report["errors"]["force"]) <= 1e-5
     for side in ("lower", "upper"):
         data = [solution.contact(f"{side} bar {i}") for i in (1, 2)]
         force = sum(float(d.force.sum()) for d in data)
@@ -91,8 +187,6 @@ def test_forces_balance_and_the_bound_is_reached_where_nodes_slip(quick_demo, co
     solution, report = found.solution, found.report
     assert report["bodies"] == 4
     assert report["free_modes"] == 0
-    assert abs(report["errors"]["force_wedge"]) <= 1e-5
-    assert abs(report["errors"]["force_base"]) <= 1e-5
     assert report["sticking"] > 0
     for name in PAIRS:
         size, slips = check_friction(solution.contact(name), BOUND * (1.0 + 1e-9))
@@ -108,65 +202,11 @@ def test_forces_balance_and_the_bound_is_reached_where_nodes_slip(quick_demo, co
     assert report["sliding"] >= 2 * slipping[0]
 
 
-@pytest.mark.parametrize(
-    ("name", "tolerance"), [("hertz_2d", 0.02), ("hertz_3d", 0.05), ("sphere_on_block_3d", 0.05)]
-)
-def test_small_sizes_are_near_the_closed_form(quick_demo, name, tolerance):
-    errors = quick_demo(name).report["errors"]
-    assert abs(errors["force"]) <= 1e-4
-    assert abs(errors["half_width"]) <= tolerance
-    assert abs(errors["peak_pressure"]) <= tolerance
-
-
 def test_stacked_blocks_are_held_by_contact_alone(quick_demo):
     """Each of the three upper blocks slides and turns freely on its flat sides: 3 modes each."""
     report = quick_demo("stacked_blocks_3d").report
     assert report["bodies"] == 4
     assert report["free_modes"] == 9
-    assert abs(report["errors"]["force_base"]) <= 1e-5
-
-
-def test_a_bouncing_bar_is_as_in_closed_form(quick_demo):
-    """Up to the end of the first impact, on few cells."""
-    report = quick_demo("bouncing_bar").report
-    for name, most in (("first_begin", 0.01), ("first_end", 0.03), ("first_pressure", 0.01)):
-        assert abs(report["errors"][name]) <= most
-    assert report["in_all"]["assemblies"] == report["in_all"]["gluings"] == 1
-
-
-def test_an_impact_of_bars_is_as_in_closed_form(quick_demo):
-    """On few cells, of two equal bars that exchange their velocities."""
-    errors = quick_demo("impact_of_bars").report["errors"]
-    most = {
-        "pressure": 0.01,
-        "duration": 0.01,
-        "oscillates": 0.01,
-        "velocity": 0.03,
-        "energy": 0.02,
-    }
-    assert all(abs(errors[f"two_{name}"]) <= bound for name, bound in most.items())
-
-
-def test_a_bolted_joint_slides_at_its_friction(quick_demo):
-    """Both sides of the pulled plate slide in the end; springs of handbooks are a rough guide."""
-    errors = quick_demo("bolted_joint_3d").report["errors"]
-    assert abs(errors["slip_of_plates"]) <= 1e-3
-    assert abs(errors["slip_of_joint"]) <= 5e-3
-    assert abs(errors["pretension_of_springs"]) <= 0.2
-
-
-def test_forces_of_ironing_balance(quick_demo):
-    """What holds the slab takes what the die does; the die piles the slab up before it."""
-    errors = quick_demo("ironing_3d").report["errors"]
-    assert errors["balance"] <= 1e-3
-    assert 0.3 < errors["force_along_over_force_down"] < 0.4
-
-
-def test_tools_balance_and_a_drawn_sheet_springs_back(quick_demo):
-    errors = quick_demo("deep_drawing_2d").report["errors"]
-    assert abs(errors["balance_of_tools"]) <= 1e-4
-    assert abs(errors["balance_of_work"]) <= 0.25  # two steps: the work is a rough sum
-    assert 0.5 < errors["springback_degrees"] < 3.0
 
 
 @pytest.mark.parametrize(
@@ -187,6 +227,6 @@ def test_a_half_ball_of_rubber_is_right_to_a_hundred_thousandth_of_its_radius(wo
             reports.append(problem.report)
         ends.append((np.array(found), reports))
     (found, reports), (tight, _) = ends
-    assert comm.allreduce(float(np.abs(found - tight).max(initial=0.0)), op=MPI.MAX) <= 1e-5
+    assert largest(found - tight) <= 1e-5
     assert max(report.assemblies for report in reports) <= 5
     assert sum(report.F_multiplications for report in reports) <= 548

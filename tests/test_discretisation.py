@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import ufl
 from bodies import drawn, held, pressed, sided, stacked, stiffer_above, two_body_problem
-from dolfinx import mesh as dmesh
 from scenes import box, clamp, curved_obstacle, decomposed, forms, hooke, problem
 from true_errors import AGAINST_FINER, ball, error_against, lame_error, shrink_fit, stress_of_cells
 
@@ -52,11 +51,8 @@ def test_against_a_finer_mesh(serial_only, scene, sizes, finest):
 def layers(names):
     """A cube of two layers, with or without names for them, E = 1 below and 10 above."""
     mesh, tags, sides = box("tetrahedron", 4)
-    cells = np.arange(mesh.topology.index_map(3).size_local, dtype=np.int32)
-    above = dmesh.compute_midpoints(mesh, 3, cells)[:, 2] > 0.5
-    cell_tags = dmesh.meshtags(mesh, 3, cells, (above + 1).astype(np.int32))
-    told = {"cell_tags": cell_tags, "volumes": {"below": 1, "above": 2}} if names else {}
-    return tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=sides, **told)
+    volumes = {"below": lambda x: x[2] <= 0.5, "above": lambda x: x[2] >= 0.5} if names else None
+    return tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=sides, volumes=volumes)
 
 
 @pytest.mark.parametrize("names", [True, False])

@@ -71,106 +71,70 @@ def test_a_row_in_two_sets_is_named():
         Product([(slice(0, 5), Bounds()), (np.array([7, 4]), Bounds())])
 
 
-class NotNearest(Bounds):
-    def project(self, x):
-        return np.abs(x)
+def broken(base=Bounds, *given, **methods):
+    """A set of which some methods are others."""
+    return type("Broken", (base,), methods)(*given)
 
 
-class NotIdempotent(Bounds):
-    def project(self, x):
-        return np.where(x > 0, x, x / 2)
-
-
-class TooLong(Bounds):
-    def max_step(self, x, p):
-        return 2.0 * super().max_step(x, p)
-
-
-class WrongSign(Bounds):
-    def split(self, x, g):
-        phi, beta = super().split(x, g)
-        return phi, -beta
-
-
-class FaceWithOpenRows(Bounds):
-    def face(self, x, g):
-        return Face(np.ones(len(x), dtype=bool), super().face(x, g).status)
-
-
-class AllTouching(Bounds):
-    def face(self, x, g):
-        return Face(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING))
-
-
-class Missing(Bounds):
-    def face(self, x, g):
-        return Face(np.zeros(len(x), dtype=bool), super().face(x, g).status)
-
-
-class Scaled(Bounds):
-    def face(self, x, g):
-        face = super().face(x, g)
-        rows = np.flatnonzero(face.free)[:, None]
-        twice, flat = np.full(rows.shape, 2.0), np.zeros(len(rows))
-        return Face(np.zeros_like(face.free), face.status, rows, twice, flat)
-
-
-class WithoutStatus(Bounds):
-    def face(self, x, g):
-        return replace(super().face(x, g), status=np.zeros(0))
-
-
-class Flat(Ellipses):
-    def face(self, x, g):
-        face = super().face(x, g)
-        return replace(face, curvature=0.0 * face.curvature)
-
-
-class LetsGo(Bounds):
-    def onto(self, x, status):
-        return self.project(x)
-
-
-class LeavesOmega(Bounds):
-    def onto(self, x, status):
-        return np.where(status == Status.OPEN, self.lower - 1.0, self.project(x))
-
-
-class NotProjecting(Bounds):
-    def onto(self, x, status):
-        return np.array(x)
-
-
-class LetsStick(Ellipses):
-    def onto(self, x, status):
-        return self.project(x)
+def scaled(self, x, g):
+    face = Bounds.face(self, x, g)
+    rows = np.flatnonzero(face.free)[:, None]
+    twice, flat = np.full(rows.shape, 2.0), np.zeros(len(rows))
+    return Face(np.zeros_like(face.free), face.status, rows, twice, flat)
 
 
 class WithoutOnto:
     project, split, max_step, face = Bounds.project, Bounds.split, Bounds.max_step, Bounds.face
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        (NotNearest(), r"P\(x\) is the nearest point"),
-        (NotIdempotent(), r"P\(P\(x\)\) = P\(x\)|nearest point"),
-        (TooLong(), "largest step"),
-        (WrongSign(), "φ \\+ β is the projected gradient"),
-        (FaceWithOpenRows(), "open rows are not in Z"),
-        (AllTouching(), r"x \+ Zt stays in Ω"),
-        (Missing(), "rows that are held are free in Z"),
-        (Scaled(), "columns of Z are orthonormal"),
-        (WithoutStatus(), "a status for each row"),
-        (Flat(np.full((5, 2), 0.05)), "bends by"),
-        (LetsGo(), "onto keeps open rows open"),
-        (LeavesOmega(), r"onto\(x, status\) ∈ Ω"),
-        (NotProjecting(), "onto without bounds is P_Ω"),
-        (LetsStick(np.full((5, 2), 1.0)), "slipping ones on their boundary"),
-        (WithoutOnto(), "a FeasibleSet has onto"),
-    ],
-    ids=lambda value: type(value).__name__ if not isinstance(value, str) else "",
-)
-def test_what_does_not_conform_is_named(wrong, words):
+def free_or_not(make):
+    """A face whose rows are all free, or none."""
+    return lambda self, x, g: Face(make(len(x), dtype=bool), Bounds.face(self, x, g).status)
+
+
+def touching(self, x, g):
+    return Face(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING))
+
+
+def below(self, x, status):
+    return np.where(status == Status.OPEN, self.lower - 1.0, self.project(x))
+
+
+def flat(self, x, g):
+    face = Ellipses.face(self, x, g)
+    return replace(face, curvature=0.0 * face.curvature)
+
+
+LETS_GO = {"onto": lambda self, x, status: self.project(x)}
+WRONG = [
+    (r"P\(x\) is the nearest point", broken(project=lambda self, x: np.abs(x))),
+    (
+        r"P\(P\(x\)\) = P\(x\)|nearest point",
+        broken(project=lambda self, x: np.where(x > 0, x, x / 2)),
+    ),
+    ("largest step", broken(max_step=lambda self, x, p: 2.0 * Bounds.max_step(self, x, p))),
+    (
+        "φ \\+ β is the projected gradient",
+        broken(split=lambda self, x, g: np.multiply(Bounds.split(self, x, g), [[1.0], [-1.0]])),
+    ),
+    ("open rows are not in Z", broken(face=free_or_not(np.ones))),
+    (r"x \+ Zt stays in Ω", broken(face=touching)),
+    ("rows that are held are free in Z", broken(face=free_or_not(np.zeros))),
+    ("columns of Z are orthonormal", broken(face=scaled)),
+    (
+        "a status for each row",
+        broken(face=lambda self, x, g: replace(Bounds.face(self, x, g), status=np.zeros(0))),
+    ),
+    ("bends by", broken(Ellipses, np.full((5, 2), 0.05), face=flat)),
+    ("onto keeps open rows open", broken(**LETS_GO)),
+    (r"onto\(x, status\) ∈ Ω", broken(onto=below)),
+    ("onto without bounds is P_Ω", broken(onto=lambda self, x, status: np.array(x))),
+    ("slipping ones on their boundary", broken(Ellipses, np.full((5, 2), 1.0), **LETS_GO)),
+    ("a FeasibleSet has onto", WithoutOnto()),
+]
+
+
+@pytest.mark.parametrize(("words", "wrong"), WRONG, ids=[words for words, _ in WRONG])
+def test_what_does_not_conform_is_named(words, wrong):
     with pytest.raises(ConformanceError, match=words):
         check_feasible_set(wrong, 10)

@@ -1,11 +1,4 @@
-"""The wheel, and packages of others beside a torn mesh, where they are installed."""
-
-import os
-import shutil
-import subprocess
-import sys
-import zipfile
-from pathlib import Path
+"""Packages of others beside a torn mesh, where they are installed."""
 
 import numpy as np
 import pytest
@@ -15,38 +8,6 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-
-ROOT = Path(__file__).parents[1]
-
-
-def test_wheel_has_what_it_needs(serial_only, tmp_path):
-    """It has every file of the package, and is imported from where it lies."""
-    setuptools = pytest.importorskip("setuptools")
-    if int(setuptools.__version__.split(".")[0]) < 77:
-        pytest.skip("pyproject.toml asks for setuptools >= 77")
-    source = tmp_path / "source"
-    source.mkdir()
-    unseen = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(ROOT / "tfeti_dolfinx", source / "tfeti_dolfinx", ignore=unseen)
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, source)
-    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation"]
-    made = subprocess.run(
-        [*command, "--wheel-dir", str(tmp_path), str(source)], capture_output=True, text=True
-    )
-    assert made.returncode == 0, made.stdout + made.stderr
-    (wheel,) = tmp_path.glob("tfeti_dolfinx-*-py3-none-any.whl")
-    with zipfile.ZipFile(wheel) as packed:
-        names = {name for name in packed.namelist() if ".dist-info/" not in name}
-    package = source / "tfeti_dolfinx"
-    assert names == {str(path.relative_to(source)) for path in package.rglob("*") if path.is_file()}
-    assert "tfeti_dolfinx/py.typed" in names
-    place = "import tfeti_dolfinx; print(tfeti_dolfinx.__file__)"
-    environment = {**os.environ, "PYTHONPATH": str(wheel)}
-    imported = subprocess.run(
-        [sys.executable, "-c", place], cwd=tmp_path, env=environment, capture_output=True, text=True
-    )
-    assert str(wheel) in imported.stdout, imported.stderr
 
 
 @pytest.fixture

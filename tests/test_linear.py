@@ -78,15 +78,3 @@ def test_patch_test():
     )
     uh = p.solve()
     assert np.allclose(uh.x.array, linear.x.array, atol=1e-9)
-
-
-def test_springs_leave_no_coarse_problem():
-    d = decomposed("hexahedron", 3, 4)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx + 0.1 * ufl.inner(u, v) * ufl.dx
-    L = ufl.inner(fem.Constant(d.mesh, (0.0, 0.0, -0.1)), v) * ufl.dx
-    p = tfeti.ContactProblem(a, L, [], [], d, petsc_options={"tfeti_rtol": 1e-11})
-    uh = p.solve()
-    assert p.report.kernel_dim == 0
-    assert np.allclose(uh.x.array.reshape(-1, 3), (0, 0, -1), atol=1e-9)

@@ -2,25 +2,19 @@
 
 import csv
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from mpi4py import MPI
+from bodies import gathered
+from scenes import largest
 from sheared import BOUND, Driven, Sheared, tops
 from steps_script import TIMES
+from test_ranks import run as run_script
 from test_repeated import Repeated
 
 import tfeti_dolfinx as tfeti
 
-HERE = Path(__file__).resolve().parent
 PATH = [0.02, 0.06, 0.06, 0.02, -0.06, -0.08, 0.06, -0.01]
-
-
-def collected(data, comm, *names):
-    return [np.concatenate(comm.allgather(getattr(data, name))) for name in names]
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
@@ -35,7 +29,7 @@ def test_a_block_pushed_and_pulled_back_slips_as_in_closed_form(cell):
         data = scene.problem.solution.contact(0)
         lost = comm.allreduce(float(np.sum(scene.problem.solution.dissipation)))
         shear, step, _ = tops(PATH)[n]
-        traction, slip = collected(data, comm, "tangential_traction", "slip")
+        traction, slip = gathered(data.tangential_traction), gathered(data.slip)
         assert np.allclose(traction[:, 0], -shear, rtol=0, atol=1e-7)
         assert np.allclose(slip[:, 0], step, rtol=0, atol=1e-7)
         assert np.allclose(traction[:, 1:], 0.0, rtol=0, atol=1e-7)
@@ -180,18 +174,14 @@ def test_a_series_for_pyvista_goes_on(comm, shared_tmp):
     assert reader.time_values == TIMES[:3]
     reader.set_active_time_value(TIMES[2])
     found = reader.read()[0]["displacement"]
-    largest = comm.allreduce(np.abs(driven.problem.u.x.array).max(initial=0.0), op=MPI.MAX)
-    assert np.isclose(np.abs(found).max(), largest, rtol=1e-12)
+    assert np.isclose(np.abs(found).max(), largest(driven.problem.u.x.array), rtol=1e-12)
     parts = [f.name for f in shared_tmp.iterdir() if f.suffix in (".vtu", ".pvtu")]
     assert len(parts) == 3 * (comm.size + 1)
 
 
 def run(ranks, scene, folder, how):
     folder.mkdir(exist_ok=True)
-    command = ["mpirun", "-n", str(ranks), sys.executable, "steps_script.py", scene, folder, how]
-    return subprocess.run(
-        list(map(str, command)), cwd=HERE, capture_output=True, text=True, timeout=300
-    )
+    return run_script(ranks, "steps_script.py", scene, folder, how)
 
 
 @pytest.fixture(scope="module")

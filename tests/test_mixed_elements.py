@@ -3,9 +3,7 @@
 import numpy as np
 import ufl
 from bodies import boxes, held, sided
-from dolfinx import fem
-from dolfinx import mesh as dmesh
-from scenes import displacement
+from scenes import displacement, vectors
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.compat import geometry_dofmap
@@ -21,18 +19,14 @@ def blocks(n):
     """A block on one of half its modulus, which it touches in a part of its bottom."""
     parts = [("lower", (0.0, -1.0), (1.0, 0.0), (n, n)), ("upper", (0.0, 0.0), (1.0, 1.0), (n, n))]
     mesh, facet_tags, names = boxes("triangle", parts)
-    cells = np.arange(len(geometry_dofmap(mesh)), dtype=np.int32)
-    above = (dmesh.compute_midpoints(mesh, 2, cells)[:, 1] > 0).astype(np.int32)
     x, dofmap = mesh.geometry.x, geometry_dofmap(mesh)
-    of_upper = np.zeros(len(x), dtype=bool)
-    of_upper[dofmap[above > 0].ravel()] = True
+    of_upper = np.unique(dofmap[x[dofmap][:, :, 1].mean(axis=1) > 0.0])
     x[of_upper, 1] += (0.1 * x[:, 0] ** 2 * (1.0 - x[:, 1]))[of_upper]
     return tfeti.decompose(
         mesh,
         lambda x: (x[1] > 0).astype(int),
-        cell_tags=dmesh.meshtags(mesh, 2, cells, 1 + above),
         facet_tags=facet_tags,
-        volumes={"lower": 1, "upper": 2},
+        volumes={"lower": lambda x: x[1] <= 1e-9, "upper": lambda x: x[1] >= -1e-9},
         surfaces=names,
     )
 
@@ -40,8 +34,7 @@ def blocks(n):
 def probed(n, elements, grid):
     """Displacements of the nodes of a grid on sides that are free or loaded."""
     d = blocks(n)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    V, u, v = vectors(d)
     elastic = tfeti.Elasticity(d, E={"lower": 1.0, "upper": 2.0}, nu=0.3, model="plane_strain")
     ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
     pressure = 0.01 * (1 + ufl.SpatialCoordinate(d.mesh)[0])

@@ -1,17 +1,16 @@
 """Block Newton against independent solutions and SMALSE-M, and what it costs."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from reference.untorn import check_optimal
 from scipy.sparse import block_diag, csr_array, diags_array
-from test_qp import Counted, bounds_on, matrix, vector
+from test_newton_discs import solved
+from test_qp import bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import solve_by_pcpg
-from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import QP, Start, StoppingRule, homogenise, operator_product
+from tfeti_dolfinx.qp.newton import first_point, newton
+from tfeti_dolfinx.qp.problem import QP, StoppingRule, homogenise, operator_product
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import Bounds, Product
 
@@ -37,19 +36,6 @@ def program(seed, kind="regular"):
     return F, 3.0 * rng.standard_normal(m), G, G @ feasible, bounded
 
 
-def qp_of(F, d, G, e, bounded):
-    return QP(Counted(matrix(F)), vector(d), DenseCoarse(G, e), bounds_on(bounded))
-
-
-def solved(qp, tolerance, start=None):
-    at = operator_product(
-        qp.F, qp.coarse.comm, feasible_start(qp, start) if start else first_point(qp)
-    )
-    found = newton(qp, homogenise(qp, at), StoppingRule(tolerance), max_it=3000, start=start)
-    assert found.reason > 0
-    return found
-
-
 KINDS = ["regular", "held by bounds", "dependent", "no kernel"]
 
 
@@ -57,21 +43,13 @@ KINDS = ["regular", "held by bounds", "dependent", "no kernel"]
 @pytest.mark.parametrize("seed", range(5))
 def test_random_programs(kind, seed):
     F, d, G, e, bounded = program(seed, kind)
-    result = solved(qp_of(F, d, G, e, bounded), 1e-9)
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), bounds_on(bounded))
+    result = solved(qp, 1e-9)
+    assert result.reason > 0
     # forces that are their small difference leave rounding where rows depend on each other
     share = 1e-5 if kind == "dependent" else 1e-8
     check_optimal(F, d, G, e, bounded, result.lam, share, result.mu)
     assert np.all(result.lam[bounded] >= 0.0)
-
-
-def test_from_its_own_solution_it_multiplies_once():
-    F, d, G, e, bounded = program(3)
-    qp = qp_of(F, d, G, e, bounded)
-    found = solved(qp, 1e-9)
-    before = qp.F.count
-    again = solved(replace(qp, seen=found.norm), 1e-8, Start(found.lam, found.mu))
-    assert qp.F.count == before + 1
-    assert np.allclose(again.lam, found.lam, atol=1e-8)
 
 
 @pytest.mark.parametrize("stiff", [1e3, 1e6])

@@ -4,8 +4,8 @@ import numpy as np
 import ufl
 from bodies import boxes, stacked
 from dolfinx import fem
-from mpi4py import MPI
 from reference.nonlinear import neo_hooke, pressed_ring
+from scenes import accepted, largest, unknowns
 
 import tfeti_dolfinx as tfeti
 
@@ -58,11 +58,9 @@ def test_a_scene_that_is_turned_has_no_stress(comm):
         turn.interpolate(
             lambda x, c=c, s=s: (c * x[0] - s * x[1] - x[0], s * x[0] + c * x[1] - x[1])
         )
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         assert total(comm, square) < 1e-20
-        error = np.abs(u.x.array - turn.x.array).max(initial=0.0)
-        assert comm.allreduce(error, op=MPI.MAX) < 1e-9
+        assert largest(u.x.array - turn.x.array) < 1e-9
 
 
 def moving(decomposition, *fixed):
@@ -79,8 +77,7 @@ def test_forces_balance_and_friction_only_dissipates(comm):
     problem, _ = hyperelastic(decomposition, conditions, contact, rtol=1e-8)
     lost = 0.0
     for way.value[:] in ((0.0, -0.1), (0.2, -0.12), (-0.1, -0.1), (-0.1, 0.1)):
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         solution = problem.solution
         held = [solution.reaction(side) for side in ("lower bottom", "upper top")]
         below, above = (reaction.force for reaction in held)
@@ -107,8 +104,7 @@ def test_moments_balance_about_where_bodies_are(comm):
     ground = tfeti.Obstacle("upper bottom", plane, friction=tfeti.Coulomb(0.3))
     problem, _ = hyperelastic(decomposition, conditions, ground)
     for way.value[:] in ((0.0, -0.1), (0.3, -0.2)):
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         held, pushed = problem.solution.reaction("upper top"), problem.solution.contact(0).resultant
         size = np.linalg.norm(pushed.force)
         assert np.allclose(held.force, -pushed.force, rtol=0, atol=1e-9 * size)
@@ -140,8 +136,7 @@ def test_moments_balance_on_a_flat_interface(comm):
     """Two blocks that do not match, of steel that yields, pressed and drawn with friction."""
     decomposition = stacked("triangle", 4, 3, 3, upper=(0.2, 0.8))
     way, conditions = moving(decomposition, "lower bottom")
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-    u, v, w = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    V, u, v, w = unknowns(decomposition)
     bcs = [
         fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, decomposition.facets(side)), V)
         for side, _, value in conditions(V)
@@ -154,11 +149,10 @@ def test_moments_balance_on_a_flat_interface(comm):
         steel.residual(v), u, bcs, [contact], decomposition, petsc_options={"rtol": 1e-9}, **given
     )
     for way.value[:] in ((0.0, -0.05), (0.03, -0.06)):
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         left, of = unbalanced(problem)
         assert left < 1e-9 < 0.1 < of
-    assert comm.allreduce(steel.p.x.array.max(initial=0.0), op=MPI.MAX) > 0.01
+    assert largest(steel.p.x.array) > 0.01
 
 
 def test_moments_balance_to_h_squared_on_a_curved_interface(comm):
@@ -178,8 +172,7 @@ def test_moments_balance_to_h_squared_on_a_curved_interface(comm):
             ways[0].interpolate(
                 lambda x, c=c, s=s: (c * x[0] - s * x[1] - x[0], s * x[0] + c * x[1] - x[1])
             )
-            problem.solve()
-            problem.accept()
+            accepted(problem)
         left, of = unbalanced(problem)
         assert of > 0.1
         found.append(left)
@@ -205,5 +198,5 @@ def test_a_curved_patch_is_right_to_h_squared(comm):
         x = problem.u.function_space.tabulate_dof_coordinates()[:, :2]
         u, R = problem.u.x.array.reshape(-1, 2), np.linalg.norm(x, axis=1)
         exact = (radius(R) / R - 1.0)[:, None] * x
-        errors.append(comm.allreduce(np.abs(u - exact).max(initial=0.0), op=MPI.MAX))
+        errors.append(largest(u - exact))
     assert errors[1] < 0.3 * errors[0] < 0.01

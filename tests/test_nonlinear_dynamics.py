@@ -9,16 +9,12 @@ from dolfinx import mesh as dmesh
 from moving import Thrown
 from mpi4py import MPI
 from reference.nonlinear import block, by_dolfinx, nearest_nodes, neo_hooke
-from scenes import decomposed, hooke, strain
+from scenes import accepted, decomposed, hooke, largest, strain, unknowns
 
 import tfeti_dolfinx as tfeti
 
 E, NU, RHO = 1.0, 0.3, 1.0
 DX = {"metadata": {"quadrature_degree": 4}}
-
-
-def largest(comm, values):
-    return comm.allreduce(float(np.abs(values).max(initial=0.0)), op=MPI.MAX)
 
 
 def field(V, values):
@@ -37,17 +33,14 @@ def bending(x):
     return spinning(x) + np.array([0.3 * np.sin(x[0] * x[1]), 0.2 * np.cos(2 * x[0])])
 
 
-def rubber(n=2, velocity=bending, contacts=(), rtol=1e-11, subdomains=4, **more):
-    """A block of neo-Hooke that flies, and what its momentum and energy are."""
-    mesh, tags = block(2, n, 0.0, MPI.COMM_WORLD)
-    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces={"low": 1, "top": 2})
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = fem.Function(V), field(V, velocity)
+def flying(d, velocity, contacts=(), rtol=1e-11, **more):
+    """Bodies of neo-Hooke that fly, and what their momentum and energy are."""
+    V, u, test, _ = unknowns(d)
+    v, now = field(V, velocity), fem.Function(V)
     energy = neo_hooke(u, E, NU) * ufl.dx(**DX)
     given = {"mass": RHO, "velocity": v, "finite": True, "petsc_options": {"rtol": rtol}}
-    F = ufl.derivative(energy, u, ufl.TestFunction(V))
+    F = ufl.derivative(energy, u, test)
     problem = tfeti.NonlinearContactDynamics(F, u, [], contacts, d, **{**given, **more})
-    now = fem.Function(V)
     x = ufl.SpatialCoordinate(d.mesh) + u
     figures = [
         *(RHO * now[i] * ufl.dx for i in range(2)),
@@ -63,13 +56,19 @@ def rubber(n=2, velocity=bending, contacts=(), rtol=1e-11, subdomains=4, **more)
     return problem, kept
 
 
+def rubber(n=2, velocity=bending, subdomains=4, **more):
+    """A block."""
+    mesh, tags = block(2, n, 0.0, MPI.COMM_WORLD)
+    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces={"low": 1, "top": 2})
+    return flying(d, velocity, **more)
+
+
 def fly(problem, kept, size, steps):
     """Momentum in two directions, moment of momentum, energy: of the begin and of all steps."""
     found = [kept()]
     problem.take_step(size)
     for _ in range(steps):
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         found.append(kept(problem.solution.velocity))
     return np.array(found)
 
@@ -105,7 +104,7 @@ def test_steps_are_those_of_dolfinx_own_solver(comm):
         v.x.array[:] += 2 / tau * (u.x.array - w.x.array)
     nodes = nearest_nodes(W, problem.u.function_space)
     expected = u.x.array.reshape(-1, 2)[nodes]
-    assert largest(comm, problem.u.x.array.reshape(-1, 2) - expected) <= 1e-8
+    assert largest(problem.u.x.array.reshape(-1, 2) - expected) <= 1e-8
 
 
 @pytest.mark.parametrize("stabilised", [False, True])
@@ -130,11 +129,10 @@ def test_a_linear_body_takes_the_steps_of_the_linear_problem(stabilised, comm):
     for n in range(10):
         weight.value[0] = scene.weight.value[0] = 0.01 * n
         ((motion, forces),) = scene.step(0.1)
-        problem.solve()
-        problem.accept()
-        assert largest(comm, u.x.array - scene.problem.u.x.array) <= 1e-8
+        accepted(problem)
+        assert largest(u.x.array - scene.problem.u.x.array) <= 1e-8
         ends = [p.solution.velocity.x.array for p in (problem, scene.problem)]
-        assert largest(comm, ends[0] - ends[1]) <= 1e-7
+        assert largest(ends[0] - ends[1]) <= 1e-7
         report = problem.report
         assert report.contact_forces[0] == pytest.approx(forces[0], abs=1e-7)
         most = max(most, motion["energy"])
@@ -156,8 +154,7 @@ def test_an_impact_in_finite_strain_balances(stabilised, comm):
     begin, tau, impulse = kept(), 0.1, 0.0
     problem.take_step(tau)
     for _ in range(14):
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         motion, forces = problem.report.motion, problem.report.contact_forces
         assert abs(motion["defect"]) <= 1e-7 * begin[3]
         assert motion["predictor"] <= 1e-9 * begin[3]
@@ -173,42 +170,17 @@ def test_an_impact_in_finite_strain_balances(stabilised, comm):
 def test_a_block_that_turns_on_another_one_gains_no_energy(comm):
     """Though normals turn, and meshes do not match; momentum is kept, moments nearly."""
     d = stacked("quadrilateral", 2, 3, 4, gap=0.05)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, now = fem.Function(V), fem.Function(V)
-    energy = neo_hooke(u, E, NU) * ufl.dx(**DX)
 
     def thrown(x):
         above = x[1] > 0.0
         return above * np.array([0.2 - 0.5 * (x[1] - 0.55), -0.3 + 0.5 * (x[0] - 0.5)])
 
-    problem = tfeti.NonlinearContactDynamics(
-        ufl.derivative(energy, u, ufl.TestFunction(V)),
-        u,
-        [],
-        [tfeti.Contact("upper bottom", "lower top", reach=1.0)],
-        d,
-        mass=RHO,
-        finite=True,
-        velocity=field(V, thrown),
-        stabilised=True,
-        petsc_options={"rtol": 1e-7},
-    )
-    x = ufl.SpatialCoordinate(d.mesh) + u
-    kinetic = RHO / 2 * ufl.dot(now, now) * ufl.dx
-    moment = (x[0] * now[1] - x[1] * now[0]) * ufl.dx
-    forms = [
-        fem.form(form) for form in (now[0] * ufl.dx, now[1] * ufl.dx, moment, energy + kinetic)
-    ]
-
-    def kept(velocity):
-        now.x.array[:] = velocity.x.array
-        return np.array([d.comm.allreduce(fem.assemble_scalar(form)) for form in forms])
-
-    begin = kept(field(V, thrown))
+    pair = tfeti.Contact("upper bottom", "lower top", reach=1.0)
+    problem, kept = flying(d, thrown, [pair], rtol=1e-7, stabilised=True)
+    begin = kept()
     problem.take_step(0.04)
     for _ in range(30):
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         end = kept(problem.solution.velocity)
         assert end[:2] == pytest.approx(begin[:2], abs=1e-7)
         assert 0.9 * begin[3] <= end[3] <= 1.001 * begin[3]
@@ -223,8 +195,7 @@ def bar(comm):
     )
     sides = {"left": lambda x: np.isclose(x[0], 0.0)}
     d = tfeti.decompose(mesh, 3, surfaces=sides)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    V, u, v, du = unknowns(d)
     elastic = tfeti.Elasticity(d, E=1.0, nu=0.3, model="plane_strain")
     steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.02, hardening=0.1)
     wall = tfeti.Obstacle("left", tfeti.Plane((-0.01, 0.0), normal=(1.0, 0.0)), reach=1.0)
@@ -261,8 +232,8 @@ def test_a_plastic_impact_loses_energy_and_goes_on_from_its_checkpoint(comm, sha
     series(9, "parts")
     _, *parts = series(40, "parts", resume=True)
     for found, expected in zip(parts, whole, strict=True):
-        assert largest(comm, found - expected) <= 1e-7
-    assert largest(comm, whole[2]) > 0.01
+        assert largest(found - expected) <= 1e-7
+    assert largest(whole[2]) > 0.01
     begin, end = 0.5 * 3.0 * 0.1**2, records[-1].motion["kinetic"]
     assert end < 0.8 * begin  # an elastic bar keeps nearly all
     assert records[-1].contact_forces[0] == [0.0, 0.0]
@@ -271,8 +242,7 @@ def test_a_plastic_impact_loses_energy_and_goes_on_from_its_checkpoint(comm, sha
 def test_a_step_that_is_given_up_leaves_no_trace(comm):
     problem, steel = bar(comm)
     problem.take_step(0.25)
-    problem.solve()
-    problem.accept()
+    accepted(problem)
     u, p = problem.u.x.array.copy(), steel.p.x.array.copy()
     problem.take_step(2.0)
     problem.solve()
@@ -284,9 +254,8 @@ def test_a_step_that_is_given_up_leaves_no_trace(comm):
     other, _ = bar(comm)
     other.take_step(0.25)
     for _ in range(2):
-        other.solve()
-        other.accept()
-    assert largest(comm, problem.u.x.array - other.u.x.array) <= 1e-8
+        accepted(other)
+    assert largest(problem.u.x.array - other.u.x.array) <= 1e-8
 
 
 def test_mistakes_are_named(comm):

@@ -39,14 +39,22 @@ def test_it_conforms():
     check_feasible_set(HalfSpaces(-np.arange(1.0, 11.0), np.linspace(-1.0, 2.0, 10)), 10)
 
 
-@pytest.mark.parametrize("limit", [1e-4, 1e6])
-def test_glue_that_lets_go_at_a_limit(limit):
+def glued(cell, n, subdomains, limit):
+    """A box whose contact pulls up to the limit that a function says."""
+
     def pulling(constraints):
-        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), limit))
+        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), limit()))
         return Product([(constraints.sets.normals, half_spaces)])
 
-    obstacle, own = Obstacle("bottom", curved_obstacle(3)), Extensions(feasible_set=pulling)
-    p = problem(decomposed("hexahedron", 4, 6), contacts=[obstacle], extensions=own, rtol=1e-9)
+    d = decomposed(cell, n, subdomains)
+    obstacle = Obstacle("bottom", curved_obstacle(d.mesh.geometry.dim))
+    own = Extensions(feasible_set=pulling)
+    return problem(d, contacts=[obstacle], extensions=own, rtol=1e-9)
+
+
+@pytest.mark.parametrize("limit", [1e-4, 1e6])
+def test_glue_that_lets_go_at_a_limit(limit):
+    p = glued("hexahedron", 4, 6, lambda: limit)
     noise = 1e-7 * p.solve().x.petsc_vec.norm(3)
     rows = p.solution.gluing.contact.condition
     force, gap = p.solution.force[rows], p.solution.remaining_gap[rows]
@@ -61,13 +69,7 @@ def test_glue_that_lets_go_at_a_limit(limit):
 
 def test_a_set_that_changes_is_asked_for_before_each_solve():
     limit, found = [1e6], []
-
-    def pulling(constraints):
-        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), limit[0]))
-        return Product([(constraints.sets.normals, half_spaces)])
-
-    obstacle, own = Obstacle("bottom", curved_obstacle(2)), Extensions(feasible_set=pulling)
-    p = problem(decomposed("triangle", 3, 3), contacts=[obstacle], extensions=own, rtol=1e-9)
+    p = glued("triangle", 3, 3, lambda: limit[0])
     for limit[0] in (1e6, 0.0):
         p.solve()
         found.append(p.dofs.comm.allreduce(p.solution.force.min(initial=0.0), op=min))

@@ -52,6 +52,7 @@ def test_numbers_of_subdomains_do_not_matter(serial_only, solved):
 
 def test_more_ranks_than_subdomains(serial_only, solved):
     one, four = solved(1, FEW), solved(4, FEW)
+    assert min(one["late"], four["late"]) > 0
     assert relative(four["u"], one["u"]) <= 1e-8
 
 

@@ -1,6 +1,5 @@
 """Round parts with flat interfaces, of meshes that ranks share in any way."""
 
-import gmsh
 import numpy as np
 import pymetis
 import pytest
@@ -8,10 +7,11 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import box
+from scenes import box, clamp, vectors
 from scipy.spatial import Delaunay
 
 import tfeti_dolfinx as tfeti
+from meshes.half_ball import build
 from tfeti_dolfinx.common.compat import GRAPH_PARTITIONERS, geometry_dofmap
 from tfeti_dolfinx.mesh.cell_graph import CellGraph, Pieces
 from tfeti_dolfinx.mesh.partition import connected_parts, make_parts
@@ -162,35 +162,13 @@ def test_parts_are_connected_balanced_and_as_round_as_those_of_metis():
 
 def test_parts_of_a_graded_mesh_cost_what_those_of_others_do():
     """A half ball on a plane, cells there 100 times shorter than its radius; boxes take 67 F."""
-    model = None
-    if COMM.rank == 0:
-        gmsh.initialize(interruptible=False)
-        gmsh.option.setNumber("General.Terminal", 0)
-        model = gmsh.model
-        ball = model.occ.addSphere(0, 0, 1, 1, angle1=-np.pi / 2, angle2=0)
-        model.occ.synchronize()
-        sides = [tag for _, tag in model.getBoundary([(3, ball)], oriented=False)]
-        top = max(sides, key=lambda tag: model.occ.getCenterOfMass(2, tag)[2])
-        model.addPhysicalGroup(3, [ball], name="ball")
-        model.addPhysicalGroup(2, [top], name="top")
-        model.addPhysicalGroup(2, [tag for tag in sides if tag != top], name="low")
-        far = "(sqrt(x^2+y^2+z^2)-0.15)"
-        field = model.mesh.field.add("MathEval")
-        model.mesh.field.setString(field, "F", f"0.0112+0.1*({far}+fabs({far}))")
-        model.mesh.field.setAsBackgroundMesh(field)
-        for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
-            gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
-        gmsh.option.setNumber("Mesh.Algorithm3D", 10)
-        model.mesh.generate(3)
+    model = build(1.0, 0.0112, 0.15, 0.2) if COMM.rank == 0 else None
     cut = tfeti.read_gmsh(model, COMM, 40)
-    if COMM.rank == 0:
-        gmsh.finalize()
-    V = fem.functionspace(cut.mesh, ("Lagrange", 1, (3,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    V, u, v = vectors(cut)
     a = tfeti.Elasticity(cut, E=1.0, nu=0.3).a(u, v)
     down = fem.Constant(cut.mesh, (0.0, 0.0, -0.01))
-    bcs = [fem.dirichletbc(down, fem.locate_dofs_topological(V, 2, cut.facets("top")), V)]
-    plane = tfeti.Obstacle("low", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)))
+    bcs = [clamp(V, cut.facets("top"), down)]
+    plane = tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)))
     problem = tfeti.ContactProblem(a, ufl.ZeroBaseForm((v,)), bcs, [plane], cut)
     problem.solve()
     assert problem.report.F_multiplications < 25

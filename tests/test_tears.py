@@ -5,7 +5,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from scenes import decomposed, displacement, hooke, strain
+from scenes import decomposed, displacement, hooke, strain, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -26,8 +26,7 @@ def condition(V, facets, component=None):
 def problem(d, degree, conditions, **options):
     """The weight of a box, held by what is made from its space."""
     gdim = d.mesh.geometry.dim
-    V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    V, u, v = vectors(d, degree)
     dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * degree})
     weight = fem.Constant(d.mesh, (0.0,) * (gdim - 1) + (-0.1,))
     a, L = ufl.inner(hooke()(u), strain(v)) * dx, ufl.inner(weight, v) * dx

@@ -7,7 +7,7 @@ from bodies import held, pressed, two_body_problem
 from dolfinx import fem, geometry
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import hooke, strain
+from scenes import hooke, strain, vectors
 
 import tfeti_dolfinx as tfeti
 from benchmarks.pressures import LineContact
@@ -50,8 +50,7 @@ AGAINST_FINER = [
 def ring_problem(cells, degree, mesh, springs=1e-6, options=None, **contact):
     """Two rings; weak springs hold them against motions that contact leaves free."""
     d = rings(MPI.COMM_WORLD, cells, degree, **mesh)
-    V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    V, u, v = vectors(d, degree)
     dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 4 * degree - 2})
     spring, none = fem.Constant(d.mesh, springs), fem.Constant(d.mesh, (0.0, 0.0))
     a, L = (

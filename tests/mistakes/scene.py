@@ -24,11 +24,6 @@ class Scene:
         return Scene("hexahedron")
 
     @cached_property
-    def finer(self):
-        """The same square with 16 cells."""
-        return Scene(n=4)
-
-    @cached_property
     def box(self):
         return box(self.cell, self.n)
 

@@ -75,7 +75,8 @@ class Interior:
         W = fem.functionspace(self._dofs.V.mesh, ("DG", 0, shape) if shape else ("DG", 0))
         function = fem.Function(W, name=name)
         layout = np.asarray(W.dofmap.list)[:, 0]
-        function.x.array.reshape(len(layout), -1)[layout] = values.reshape(len(values), -1)
+        size = int(np.prod(shape, dtype=int))  # a rank may have no cells
+        function.x.array.reshape(-1, size)[layout] = values.reshape(-1, size)
         return function
 
     def _stress(self) -> Array:
