@@ -160,23 +160,14 @@ class ContactSummary:
     @classmethod
     def of_solution(cls, solution: Solution) -> list[Self]:
         """Sum up all contacts of a solution. Collective."""
-        comm, of, count = (
-            solution.dofs.comm,
-            solution.gluing.records.contact,
-            len(solution.contacts),
-        )
+        comm, of = solution.dofs.comm, solution.gluing.records.contact
+        count = len(solution.contacts)
         if count == 0:
             return []
         status = solution.status_of_conditions
-        kinds = (ContactStatus.STICK, ContactStatus.SLIP)
-        own = np.column_stack(
-            (
-                np.ones(len(of)),
-                status != ContactStatus.OPEN,
-                *(status == kind for kind in kinds),
-                solution.condition_forces,
-            )
-        )
+        kinds = [status == kind for kind in (ContactStatus.STICK, ContactStatus.SLIP)]
+        flags = [np.ones(len(of)), status != ContactStatus.OPEN, *kinds]
+        own = np.column_stack((*flags, solution.condition_forces))
         sums = summed(comm, sum_rows(of, own, count))
         extremes = np.full((2, count), -np.inf)
         np.maximum.at(extremes[0], of, solution.contact_pressure)
