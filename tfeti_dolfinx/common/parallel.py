@@ -98,10 +98,8 @@ class Exchange:
     """Rows that travel to other ranks, and answers that travel back.
 
     The communication pattern is found once; any number of arrays may follow it. Creation, with the
-    rank that each row goes to, and both methods are collective.
-
-    Attributes:
-        source: Rank that each received row comes from, shape ``(m,)``, ascending.
+    rank that each row goes to, and both methods are collective. ``source`` is the rank that each
+    received row comes from, shape ``(m,)``, ascending.
     """
 
     def __init__(self, comm: MPI.Intracomm, destination: Array) -> None:

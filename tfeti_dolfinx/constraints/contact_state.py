@@ -144,10 +144,7 @@ class ContactState:
     """Displacement, multipliers, and what follows for the contact conditions of this rank.
 
     u is in primal order, shape ``(num_nodes * bs,)``; areas are multiplied by the thickness, a
-    number or a scalar in UFL.
-
-    Attributes:
-        finite: Whether forces act at X + u, as in finite strain.
+    number or a scalar in UFL. ``finite``: forces act at X + u, as in finite strain.
     """
 
     def __init__(

@@ -188,9 +188,7 @@ class LateDirichlet(DualOperator):
     """The lumped preconditioner, until it has taken ``steps``; then that of Dirichlet.
 
     Directions of PCPG and of conjugate residuals are kept, so they go on through the change.
-
-    Attributes:
-        steps: Multiplications by the lumped one; 0: S pays, as more solves come.
+    Without ``steps`` S pays, as more solves come.
     """
 
     def __init__(self, B: PETSc.Mat, subdomains: Subdomains) -> None:

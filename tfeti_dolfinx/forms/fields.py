@@ -195,11 +195,8 @@ class StressRecovery:
     taken at the node (superconvergent patch recovery: Zienkiewicz, Zhu, Int. J. Numer. Methods Eng.
     33, 1992); for higher degrees the values of the cells at the node are averaged. Creation and all
     methods are collective. Later values of u are read at each call of ``squares``; σ_h is its
-    stress in UFL, 3×3, and the thickness multiplies areas.
-
-    Attributes:
-        cells: Space of numbers for cells.
-        cell_dof: Unknown of each local cell in it.
+    stress in UFL, 3×3, and the thickness multiplies areas. ``cells`` is the space of numbers for
+    cells, ``cell_dof`` the unknown of each local cell in it.
     """
 
     def __init__(self, u: fem.Function, sigma: Any, dofs: TornDofs, thickness: Any) -> None:

@@ -61,11 +61,8 @@ class Motion:
 class Inertia:
     """Mass of the bodies, and where a time step begins. Creation and all methods are collective.
 
-    ``compiled`` compiles the form of a name.
-
-    Attributes:
-        motion: Where the step begins.
-        ends: The load at its end.
+    ``compiled`` compiles the form of a name. ``motion`` is where the step begins, ``ends`` the load
+    at its end.
     """
 
     def __init__(
@@ -152,10 +149,8 @@ class Inertia:
 class InertialForms(Forms):
     """The matrix and the load of a step. Creation and all methods are collective.
 
-    The arguments are those of ``Forms``; L is the load as it is at the end of the step.
-
-    Attributes:
-        inertia: M, and where the step begins.
+    The arguments are those of ``Forms``; L is the load as it is at the end of the step. ``inertia``
+    has M, and where the step begins.
     """
 
     def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:

@@ -142,12 +142,7 @@ def imbalance(coarse: Coarse, x: Array) -> float:
 
 
 class DenseCoarse(Coarse):
-    """A constraint from a dense G, for a program on one rank.
-
-    Args:
-        G: Shape ``(r, m)``.
-        e: Shape ``(r,)``.
-    """
+    """A constraint from a dense G, for a program on one rank. Shapes ``(r, m)`` and ``(r,)``."""
 
     def __init__(self, G: Array, e: Array) -> None:
         inverse = np.linalg.pinv(G @ G.T, hermitian=True)

@@ -299,10 +299,8 @@ class SparseBlock(Block):
     of the stiffness is that of the first of them. Creation raises an InputError where K is not
     symmetric, not finite or not positive semidefinite, or the load is not finite; a FactorError
     where a factor could not be made. ``equals`` finds the stiffness among those of equal
-    subdomains; without it, it shares none.
-
-    Attributes:
-        place: Unknown of the stiffness for each of its own, shape ``(n,)``.
+    subdomains; without it, it shares none. ``place`` is the unknown of the stiffness for each of
+    its own, shape ``(n,)``.
     """
 
     def __init__(
