@@ -272,7 +272,12 @@ class Bodies:
         self.count, self.k = subdomains.num_bodies, subdomains.num_modes
         metric = subdomains.modes_metric()
         self.nodes = metric[:, :1, :1].max(axis=(1, 2), initial=1.0)
-        W = self.frames = bcast_from_root(comm, _frames(metric / self.nodes[:, None, None]))
+        # symmetric inverse roots; a direction without extent is left as it is
+        values, vectors = np.linalg.eigh(metric / self.nodes[:, None, None])
+        extent = values > TOLERANCES.dependent * values.max(axis=1, initial=0.0, keepdims=True)
+        roots = np.where(extent, values, 1.0) ** -0.5
+        W = (vectors * roots[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+        self.frames = W = bcast_from_root(comm, np.asarray(W))
         shares = np.swapaxes(W, 1, 2) @ subdomains.modes_outside() @ W
         self.unsprung = bcast_from_root(comm, unsprung(shares))
         inside = rows_over(comm, subdomains.modes_in_kernel).csr()
@@ -296,14 +301,6 @@ class Bodies:
     def amounts(self, motion: Array) -> Array:
         """Return the coefficient of each mode in a motion, shape ``(bodies, k)``."""
         return np.einsum("bij,bj->bi", self.frames, motion.reshape(self.count, self.k))
-
-
-def _frames(gram: Array) -> Array:
-    """Symmetric inverse roots; a direction without extent is left as it is."""
-    values, vectors = np.linalg.eigh(gram)
-    extent = values > TOLERANCES.dependent * values.max(axis=1, initial=0.0, keepdims=True)
-    roots = np.where(extent, values, 1.0) ** -0.5
-    return np.asarray((vectors * roots[:, None, :]) @ np.swapaxes(vectors, 1, 2))
 
 
 # --- Basis of the kernel with the bodies' motions ---------------------------------------------

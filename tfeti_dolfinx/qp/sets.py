@@ -207,7 +207,7 @@ class Product:
     """
 
     def __init__(self, factors: Sequence[tuple[slice | Array, FeasibleSet]] = ()) -> None:
-        self.factors = [(_indices(rows), factor) for rows, factor in factors]
+        self.factors = [(np.r_[rows], factor) for rows, factor in factors]
         rows = [np.empty(0, dtype=np.int64), *(rows for rows, _ in self.factors)]
         if np.any(twice := np.bincount(np.concatenate(rows)) > 1):
             raise InputError(
@@ -257,13 +257,6 @@ class Product:
         for rows, factor in self.factors:
             values[rows] = factor.onto(x[rows], status[rows])
         return values
-
-
-def _indices(rows: slice | Array) -> Array:
-    """Return rows as indices, in their order."""
-    if isinstance(rows, slice):
-        return np.arange(rows.start or 0, rows.stop, dtype=np.int64)
-    return np.asarray(rows, dtype=np.int64)
 
 
 # --- Ellipses ---------------------------------------------------------------------------------

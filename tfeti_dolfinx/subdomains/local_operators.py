@@ -63,13 +63,6 @@ class Group:
         dense = 2.0 * self.size**2 * self.columns
         return choice.multiplications * (once - dense) > self.work * self.size
 
-    def make_dense(self) -> None:
-        """Make A dense, symmetric to the last bit, by columns."""
-        A = _in_chunks(self.apply, np.eye(self.size, order="F"))
-        A += A.T
-        A *= 0.5
-        self.dense = A
-
     def mult(self, w: Array, out: Array) -> None:
         """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
         flat = np.zeros(self.size * self.columns)
@@ -233,8 +226,9 @@ class GroupedOperator:
         for group in self._groups:
             form = "implicit"
             if group.prefers_dense(self._choice):
-                group.make_dense()
-                form = "explicit"
+                A = _in_chunks(group.apply, np.eye(group.size, order="F"))
+                A += A.T  # symmetric to the last bit
+                group.dense, form = 0.5 * A, "explicit"
             self.forms["shared_" * (group.columns > 1) + form] += group.count
 
     def mult(self, w: Array, out: Array) -> None:
