@@ -184,6 +184,9 @@ errors["capstan_hung"] = float(-hung / tension / np.exp(-exponent) - 1)
 errors["capstan_thin"] = float(-turned / tension / np.exp(mu * theta) - 1)
 
 # ## Output
+#
+# Where the belt leaves the drum it bends back to a straight line: single nodes lift off there, and
+# others are pressed harder. The capstan equation does not know of bending.
 
 if arguments.output:
     tfeti.write_vtx(arguments.output / "belt_2d.bp", problem.solution)

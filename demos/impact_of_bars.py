@@ -189,11 +189,12 @@ if arguments.plot:
         from matplotlib.figure import Figure
 
         folder.mkdir(parents=True, exist_ok=True)
+        titles = {"two": "two free bars", "clamped": "on a clamped bar", "wall": "on a wall"}
         figure = Figure(figsize=(3 * len(names), 3.2), dpi=130, layout="constrained")
         for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
             for kind, (t, p) in panels[name].items():
                 axes.plot(t, p, linewidth=1, label=kind)
-            axes.set(title=name, xlabel="time / that of the impact")
+            axes.set(title=titles[name], xlabel="time / that of the impact")
         figure.supylabel("pressure / closed form", fontsize="medium")
         handles, labels = axes.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=2)

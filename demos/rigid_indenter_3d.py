@@ -163,6 +163,9 @@ errors["depth_by_force"] = float(np.abs(way / d - 1).max())
 # -
 
 # ## Output
+#
+# Nodal pressures on tetrahedra scatter about the closed form, in the mean by `pressure_l2`; their
+# sum is the load.
 
 # +
 if arguments.output:
@@ -187,7 +190,7 @@ if arguments.plot:
         axes = figure.subplots()
         x = np.linspace(0, deepest, 100)
         axes.plot(x, 4 / 3 * modulus * np.sqrt(R) * x**1.5, "k-", label="Hertz, half space")
-        axes.plot(d, force, "o", label="pressed by displacement")
+        axes.plot(d, force, "o", markersize=9, fillstyle="none", label="pressed by displacement")
         axes.plot(way, force, "x", label="pressed by force")
         axes.set(xlabel="depth d / R", ylabel="force F / (E R²)")
         axes.legend()

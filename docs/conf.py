@@ -64,7 +64,7 @@ if not tags.has("online"):  # type: ignore[name-defined]  # noqa: F821  # Sphinx
 TypeAliasForwardRef.__repr__ = lambda self: self.name  # type: ignore[method-assign]
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-autodoc_type_aliases = {name: name for name in ("Array", "ArrayLike", "Subdomains")}
+autodoc_type_aliases = {name: name for name in ("Array", "ArrayLike", "Gap", "Subdomains")}
 autodoc_member_order = "bysource"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
@@ -82,7 +82,9 @@ html_show_sourcelink = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 # pages without pages below them have nothing to list beside them
-html_sidebars = {f"docs/{page}": [] for page in ("index", "install", "validation", "theory")}
+html_sidebars: dict[str, list[str]] = dict.fromkeys(
+    ("README", *(f"docs/{page}" for page in ("index", "install", "validation", "theory"))), []
+)
 
 # made here: a page for each demo, and one for each class and function
 EXAMPLES, API = ROOT / "docs" / "examples", ROOT / "docs" / "api"

@@ -394,13 +394,14 @@ def _draw_status(
         axes.update_datalim(x + arrows / scale)
     for value, (name, colour) in STATUS.items():
         at = status == value
-        axes.plot(*x[at].T, "o", markersize=3, color=colour, label=f"{name}: {at.sum()}")
+        if np.any(at):
+            axes.plot(*x[at].T, "o", markersize=3, color=colour, label=f"{name}: {at.sum()}")
     axes.set_aspect("equal")
     axes.margins(0.15)
     axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     with written_whole(target) as partial:
-        figure.savefig(partial)
+        figure.savefig(partial, bbox_inches="tight")
 
 
 def _draw_curve(
@@ -415,9 +416,9 @@ def _draw_curve(
 
     shown = np.abs(x) <= (limit if limit is not None else np.abs(x).max(initial=0.0))
     order = np.argsort(x[shown])
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    figure = Figure(figsize=(7, 4.5), dpi=170, layout="constrained")
     axes = figure.subplots()
-    axes.plot(x[shown][order], p[shown][order], "o", markersize=3, label="TFETI")
+    axes.plot(x[shown][order], p[shown][order], "o", markersize=3, label="computed")
     if closed_form is not None:
         fine = np.linspace(x[shown].min(), x[shown].max(), 801)
         axes.plot(fine, closed_form(fine), "-", linewidth=1, label="closed form")
