@@ -82,9 +82,8 @@ html_show_sourcelink = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
 # pages without pages below them have nothing to list beside them
-html_sidebars: dict[str, list[str]] = dict.fromkeys(
-    ("README", *(f"docs/{page}" for page in ("index", "install", "validation", "theory"))), []
-)
+bare = ("README", "docs/index", "docs/install", "docs/validation", "docs/theory")
+html_sidebars: dict[str, list[str]] = {page: [] for page in bare}
 
 # made here: a page for each demo, and one for each class and function
 EXAMPLES, API = ROOT / "docs" / "examples", ROOT / "docs" / "api"
