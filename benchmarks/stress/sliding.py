@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import warnings
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgWarning, lu_factor, lu_solve
@@ -21,10 +20,10 @@ MOST = 100
 
 @dataclass
 class Law:
-    """Conditions on the free unknowns: arrays of doubles or of decimal digits, or sparse ones."""
+    """Conditions on the free unknowns."""
 
-    N: Any  # conditions N u ≤ gap, shape ``(c, n)``
-    T: Any  # slips T u + slip, shape ``(c (gdim - 1), n)``
+    N: csr_array  # conditions N u ≤ gap, shape ``(c, n)``
+    T: csr_array  # slips T u + slip, shape ``(c (gdim - 1), n)``
     gap: np.ndarray  # shape ``(c,)``
     slip: np.ndarray  # what prescribed values slip by, shape ``(c (gdim - 1),)``
     given: np.ndarray  # bounds of Tresca's law

@@ -6,7 +6,6 @@ import ctypes
 from collections.abc import Sequence
 from typing import Any
 
-import dolfinx
 import numpy as np
 from dolfinx import fem, graph, la
 from dolfinx import mesh as dmesh
@@ -22,7 +21,6 @@ except ImportError:
     from dolfinx.io import gmshio as _gmshio
 
 
-DOLFINX_VERSION = dolfinx.__version__  # a wheel may have another name than fenics-dolfinx
 # a compile by another rank or run may take longer than DOLFINx's 10 seconds
 JIT_OPTIONS = {"timeout": 300}
 # graph partitioners that this DOLFINx was built with
