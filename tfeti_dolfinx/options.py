@@ -166,38 +166,6 @@ class Options:
         return "\n".join(f"-{prefix}{option.name} {option.value_in(self)}" for option in known)
 
 
-# those that the first table of docs/options.md has, in words for users
-FOR_USERS = (
-    "rtol",
-    "atol",
-    "max_it",
-    "qp_type",
-    "pc_type",
-    "friction_type",
-    "error_if_not_converged",
-    "monitor",
-    "converged_reason",
-    "view",
-)
-
-
-def options_table() -> str:
-    """Return the second table of docs/options.md, of all options that are not for users."""
-    lines = ["| option | algorithm | default | effect |", "|---|---|---|---|"]
-    for option in parameters_of(Options):
-        about, default = option.description, option.default
-        if option.name in FOR_USERS:
-            continue
-        known = (*about.choices, *(("a number", *about.words) if about.words else ()))
-        values = " (" + ", ".join(known) + ")" if known else ""
-        shown = str(default).lower() if isinstance(default, bool) else f"{default}"
-        shown = shown if default != () else "none"
-        lines.append(
-            f"| `-tfeti_{option.name}` | {about.algorithm} | {shown} | {about.text}{values} |"
-        )
-    return "\n".join(lines)
-
-
 # --- Parsing of options -----------------------------------------------------------------------
 
 # what factors of subdomains, the coarse problem and contact rows read from PETSc's options
