@@ -9,6 +9,7 @@ import io
 import json
 import os
 import shutil
+import subprocess
 from contextlib import redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
@@ -79,6 +80,14 @@ def alone(name, folder):
     (folder / "site" / "tfeti_dolfinx").symlink_to(ROOT / "tfeti_dolfinx")
     path = Path(shutil.copy(ROOT / "demos" / f"{name}.py", folder))
     return path, {**os.environ, "PYTHONPATH": str(folder / "site")}
+
+
+def process(command, folder, environment=None, limit=300):
+    """Run a program to its good end; what it has printed."""
+    given = {"cwd": folder, "env": environment, "timeout": limit}
+    result = subprocess.run(list(map(str, command)), capture_output=True, text=True, **given)
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    return result.stdout + result.stderr
 
 
 def multiplications(report):

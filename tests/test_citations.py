@@ -1,12 +1,11 @@
 """``-citations`` prints the papers of the methods that a run has used, and no others."""
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from quick_demos import alone
+from quick_demos import alone, process
 
 import tfeti_dolfinx
 from tfeti_dolfinx.common.logging import PAPERS, entry
@@ -34,14 +33,11 @@ def of(*methods):
 def test_citations_of_a_run(serial_only, demo, options, methods, tmp_path):
     path, environment = alone(demo, tmp_path)
     command = [sys.executable, path, "--quick", "-citations", *options]
-    result = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=environment
-    )
-    assert result.returncode == 0, result.stderr
+    said = process(command, tmp_path, environment)
     ours = of(*PAPERS)
-    assert keys(result.stdout) & ours == of(*methods)
+    assert keys(said) & ours == of(*methods)
     for key in of(*methods):
-        assert result.stdout.count(f"{{{key},") == 1
+        assert said.count(f"{{{key},") == 1
 
 
 def test_all_solvers_have_papers_that_are_whole():

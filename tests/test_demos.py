@@ -1,11 +1,10 @@
 """Every demo runs at its quick size, serially and on ranks, with all of its outputs."""
 
 import re
-import subprocess
 import sys
 
 import pytest
-from quick_demos import DEMOS, ROOT, alone
+from quick_demos import DEMOS, ROOT, alone, process
 
 import demos
 
@@ -32,19 +31,15 @@ def test_a_demo_imports_nothing_of_the_tree_but_the_package(name):
 @pytest.mark.parametrize("name", DEMOS)
 def test_a_demo_runs_out_of_the_tree(serial_only, name, tmp_path):
     path, environment = alone(name, tmp_path)
-    command = [sys.executable, path, "--quick", "--plot"]
-    subprocess.run(command, cwd=tmp_path, check=True, timeout=300, env=environment)
+    process([sys.executable, path, "--quick", "--plot"], tmp_path, environment)
     assert list((tmp_path / "results").glob(f"{name}*.png"))
 
 
 def test_help_says_nothing_of_petsc(serial_only, tmp_path):
     path, environment = alone("hertz_2d", tmp_path)
-    command = [sys.executable, path, "--help"]
-    result = subprocess.run(
-        command, capture_output=True, text=True, timeout=100, env=environment, check=True
-    )
-    assert "--elements" in result.stdout
-    assert "WARNING" not in result.stdout + result.stderr
+    said = process([sys.executable, path, "--help"], tmp_path, environment)
+    assert "--elements" in said
+    assert "WARNING" not in said
 
 
 def test_demos_run_with_smalse():

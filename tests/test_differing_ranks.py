@@ -177,11 +177,6 @@ def a_field_on_one(s, folder):
     (s.d.to_original if ODD else s.d.locate_facets)(problem.u if ODD else of_side)
 
 
-def tagged_on_one(s, folder):
-    mesh, tags, _ = box("quadrilateral", 4)
-    tfeti.decompose(mesh, 2, facet_tags=tags if ODD else None)
-
-
 def tolerances_on_one(s, folder):
     u, held = fem.Function(s.V), [s.held()]
     F = ufl.action(s.a, u) - s.load()
@@ -228,10 +223,6 @@ CASES = {
         rf"the number of times is 3{ON}2 on rank 0",
     ),
     "a state that is cut on one": (broken(u=lambda u: u[:-1]), "the state is broken: u has"),
-    "another load on one": (
-        lambda s, folder: s.solved(L=s.load(-0.06 if ODD else -0.05)),
-        rf"L: constants\[0\]\[1\] is -0.06{ON}-0.05 on rank 0",
-    ),
     "a condition of another value on one": (
         lambda s, folder: s.solved(bcs=[s.held(0.01 if ODD else 0.0)]),
         rf"bcs\[0\]: value\[0\] is 0.01{ON}0.0 on rank 0",
@@ -250,10 +241,6 @@ CASES = {
         rf"contact is 1{ON}0 on rank 0",
     ),
     "surfaces on others": (decomposed_on_one(surfaces={}), rf"surfaces: left is not given{ON}1 on"),
-    "a monitor on one": (
-        lambda s, folder: s.problem(petsc_options={"tfeti_monitor": True} if ODD else {}),
-        "petsc_options: monitor is .* on rank 0",
-    ),
     "an extension on one": (
         lambda s, folder: s.problem(extensions=tfeti.Extensions(monitor=print) if ODD else None),
         rf"extensions: monitor is .*{ON}",
@@ -286,7 +273,6 @@ CASES = {
         a_field_on_one,
         r"rank \d has called to_original where rank 0 has called locate_facets",
     ),
-    "tags on one": (tagged_on_one, rf"facet_tags is 'given'{ON}'not given' on rank 0"),
     "tolerances of Newton's method on one": (
         tolerances_on_one,
         rf"tolerances: max_it is 9{ON}8 on rank 0",

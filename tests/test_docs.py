@@ -7,13 +7,12 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import pytest
-from quick_demos import alone
+from quick_demos import alone, process
 
 import tfeti_dolfinx as tfeti
 
@@ -52,15 +51,7 @@ def run_elsewhere(command, folder):
         _, environment = alone(demo[1], folder / "demos")
     else:
         (folder / "meshes").symlink_to(ROOT / "meshes")
-    result = subprocess.run(
-        shlex.split(command),
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=500,
-        env=environment,
-    )
-    assert result.returncode == 0, result.stderr
+    process(shlex.split(command), folder, environment, 500)
 
 
 @pytest.mark.parametrize("command", [line for line in commands() if "--plot" not in line])
@@ -85,8 +76,7 @@ ON_TWO = ("README.md", "docs/load_steps.md")
 def half_cylinder(serial_only, tmp_path_factory):
     """The mesh that the documents' programs read."""
     path = tmp_path_factory.mktemp("mesh") / "half_cylinder.msh"
-    command = [sys.executable, ROOT / "meshes/half_cylinder.py", path]
-    subprocess.run(command, capture_output=True, timeout=100, check=True)
+    process([sys.executable, ROOT / "meshes/half_cylinder.py", path], path.parent)
     return path
 
 
@@ -98,11 +88,9 @@ def test_programs_of_documents(half_cylinder, document, ranks, tmp_path):
     program.write_text("\n".join(blocks(ROOT / document, "python")))
     (tmp_path / "results").mkdir()
     shutil.copy(half_cylinder, tmp_path / "results")
-    command = ["mpirun", "-n", str(ranks), sys.executable, str(program)]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-    assert result.returncode == 0, result.stderr
-    assert "unknowns" in result.stdout
-    assert "CONVERGED_RTOL" in result.stdout
+    said = process(["mpirun", "-n", ranks, sys.executable, program], tmp_path)
+    assert "unknowns" in said
+    assert "CONVERGED_RTOL" in said
 
 
 def with_programs():
@@ -273,7 +261,7 @@ def test_the_wheel_has_what_it_needs(serial_only, tmp_path):
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet"]
-    subprocess.run([*command, "--wheel-dir", tmp_path, source], check=True, timeout=300)
+    process([*command, "--wheel-dir", tmp_path, source], tmp_path)
     (wheel,) = tmp_path.glob("tfeti_dolfinx-*-py3-none-any.whl")
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())
@@ -286,16 +274,8 @@ def test_the_wheel_has_what_it_needs(serial_only, tmp_path):
     assert "License-Expression: MIT\n" in said
     assert f"Version: {tfeti.__version__}\n" in said
     code = "import tfeti_dolfinx; print(tfeti_dolfinx.__file__, tfeti_dolfinx.__version__)"
-    result = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env={**os.environ, "PYTHONPATH": str(wheel)},
-        check=True,
-    )
-    assert str(wheel) in result.stdout
+    environment = {**os.environ, "PYTHONPATH": str(wheel)}
+    assert str(wheel) in process([sys.executable, "-c", code], tmp_path, environment)
 
 
 def test_one_version():

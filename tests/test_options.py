@@ -1,12 +1,11 @@
 """Options: parsing, precedence, ranges, documents."""
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from petsc4py import PETSc
-from quick_demos import alone
+from quick_demos import alone, process
 from scenes import decomposed, problem
 
 from tfeti_dolfinx import InputError, Options
@@ -122,11 +121,8 @@ def test_the_command_line_of_a_program(serial_only, tmp_path):
     """petsc4py.init before DOLFINx keeps the options; -log_view shows a stage per step."""
     path, environment = alone("cube_3d", tmp_path)
     command = [sys.executable, path, "--quick", "-tfeti_converged_reason", "-log_view"]
-    result = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=environment
-    )
-    assert result.returncode == 0, result.stderr
-    assert "TFETI solve CONVERGED_RTOL" in result.stdout
+    said = process(command, tmp_path, environment)
+    assert "TFETI solve CONVERGED_RTOL" in said
     for name in (
         "mesh",
         "contact",
@@ -137,5 +133,5 @@ def test_the_command_line_of_a_program(serial_only, tmp_path):
         "solve",
         "recovery",
     ):
-        assert f"tfeti: {name}" in result.stdout
-    assert "unused database" not in result.stdout + result.stderr
+        assert f"tfeti: {name}" in said
+    assert "unused database" not in said
