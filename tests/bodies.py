@@ -58,11 +58,7 @@ def stacked(cell, n_lower=3, n_upper=4, subdomains=4, upper=(0.0, 1.0), gap=0.0)
 def jagged(x):
     """Four subdomains whose interfaces zigzag through the contact zone."""
     zigzag = 0.5 + 0.12 * np.sign(np.sin(23 * x[1] + 17 * x[2] + 9 * x[0]))
-    return (
-        (x[0] > zigzag) + 2 * (x[len(x) - 1] > 0)
-        if np.ptp(x[2])
-        else (x[0] > zigzag) + 2 * (x[1] > 0)
-    )
+    return (x[0] > zigzag) + 2 * (x[2 if np.ptp(x[2]) else 1] > 0)
 
 
 def two_body_problem(d, load, bcs, contacts, degree=1, stress=None, **options):

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -334,7 +335,10 @@ def test_a_series_that_runs_again_after_an_error_writes_its_own_steps(shared_tmp
     assert not list(shared_tmp.glob(".*"))
 
 
-def test_progress_is_shown_where_wanted(capfd, comm):
+@pytest.mark.parametrize("rich", [True, False])
+def test_progress_is_shown_where_wanted(capfd, comm, monkeypatch, rich):
+    if not rich:
+        monkeypatch.setitem(sys.modules, "rich.progress", None)
     driven = Driven(n=3)
     for wanted in (None, False, True):
         tfeti.LoadSteps(driven.problem, driven.apply, [1.0], progress=wanted).run()

@@ -7,7 +7,7 @@ import pytest
 import ufl
 from bodies import held
 from dolfinx import fem
-from panels import SPACE
+from panels import SPACE, polygon
 from reference.nonlinear import neo_hooke
 from scenes import accepted, apart, clamp, decomposed, hooke, largest, strain, vectors
 
@@ -439,21 +439,22 @@ def ball_mesh(m):
 
 
 def test_distance_from_a_mesh_is_that_of_its_body():
-    """Of a cube exactly, inside, outside, next to faces, edges and corners; of a ball with h²."""
-    rng = np.random.default_rng(0)
-    panels = SPACE["cube"](1)
-    cube = tfeti.SurfaceMesh(panels.x, panels.nodes)
-    p = rng.uniform(-0.6, 1.6, (3, 400))
-    out = np.maximum(np.maximum(-p, p - 1.0), 0.0)
-    inside = np.min(np.minimum(p, 1.0 - p), axis=0)
-    expected = np.where(inside > 0.0, -inside, np.linalg.norm(out, axis=0))
-    assert np.allclose(cube.distance(p), expected, atol=1e-12)
-    step = 1e-6
-    slope = [
-        (cube.distance(p + d) - cube.distance(p - d)) / (2 * step)
-        for d in step * np.eye(3)[:, :, None]
-    ]
-    assert np.median(np.abs(cube.gradient(p) - slope)) <= 1e-8
+    """Of a square and a cube exactly, next to sides, edges and corners too; of a ball with h²."""
+    rng, step = np.random.default_rng(0), 1e-6
+    for panels in (polygon([(0, 0), (1, 0), (1, 1), (0, 1)], 1), SPACE["cube"](1)):
+        mesh, gdim = tfeti.SurfaceMesh(panels.x, panels.nodes), panels.dim
+        p = rng.uniform(-0.6, 1.6, (3, 400))
+        x = p[:gdim]
+        out = np.maximum(np.maximum(-x, x - 1.0), 0.0)
+        inside = np.min(np.minimum(x, 1.0 - x), axis=0)
+        expected = np.where(inside > 0.0, -inside, np.linalg.norm(out, axis=0))
+        assert np.allclose(mesh.distance(p), expected, atol=1e-12)
+        slope = [
+            (mesh.distance(p + d) - mesh.distance(p - d)) / (2 * step)
+            for d in step * np.eye(3)[:, :, None]
+        ]
+        assert np.median(np.abs(mesh.gradient(p) - slope)) <= 1e-8
+        assert mesh.gradient(p[:, :0]).shape == (3, 0)
     ball = tfeti.SurfaceMesh(*ball_mesh(12))
     p = rng.standard_normal((3, 200))
     assert np.abs(ball.distance(p) - np.linalg.norm(p, axis=0) + 1.0).max() <= 0.02
@@ -487,6 +488,7 @@ def test_meshes_that_do_not_fit_are_named(comm):
         ([(0, 0)], [(0, 1)], "not among 1"),
         ([(0, 0, 0)] * 3, [(0, 1, 2)], "no extent"),
         ([(0, 0, 0)], [(0, 1)], "expected"),
+        ([(0, 0), (1, 0)], [(0.0, 1.0)], "expected finite points, and integers"),
     ):
         with pytest.raises(tfeti.InputError, match=words):
             tfeti.SurfaceMesh(points, facets)
