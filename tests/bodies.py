@@ -16,15 +16,9 @@ TO_ROUNDING = {"rtol": 1e-12, "error_if_not_converged": False}
 
 
 def boxes(cell, parts, comm=MPI.COMM_WORLD):
-    """One mesh of several boxes that share no node.
+    """One mesh of several boxes that share no node, its facet tags, and names as ``tagged`` says.
 
-    Args:
-        cell: Name of the cell type.
-        parts: For each box its name, lowest corner, highest corner, cells along the axes.
-        comm: Communicator.
-
-    Returns:
-        Mesh, facet tags and names: "<box> left", "right", "bottom", "top" (3D: "front", "back").
+    ``parts``: for each box its name, lowest corner, highest corner, cells along the axes.
     """
     cell_type = dmesh.to_type(cell)
     gdim = len(parts[0][1])

@@ -18,19 +18,10 @@ def thrown_velocity(gdim, x, above, speed, along, spin):
 
 
 class Thrown:
-    """A unit box, E = ρ = 1, with a velocity that is not rigid, and where it hits.
+    """A unit box, E = ρ = 1, with a velocity that is not rigid, above a plane, or a box on it.
 
-    Args:
-        cell: Name of the cell type.
-        n: Cells along an edge.
-        gap: To the plane below, or to a box on the plane.
-        friction: Of the plane.
-        below: Whether there is a box below.
-        nu: Poisson's ratio.
-        weight: Force per volume, downwards.
-        thrown: Speed downwards of the upper box, along, and of a part that turns and shears.
-        subdomains: Of the box alone.
-        keywords: Of ``ContactDynamics``; others are options.
+    ``thrown``: speed downwards, along, and of a part that turns and shears. Keywords are those of
+    ``ContactDynamics``; others are options.
     """
 
     def __init__(

@@ -127,12 +127,7 @@ def curved_obstacle(gdim, gap=0.02):
 
 
 def gathered(dofs, node_values):
-    """Points and values of all groups of all ranks, sorted by point, on every rank.
-
-    Args:
-        dofs: Dof maps.
-        node_values: One row per local primal node.
-    """
+    """Points and values, one row per local primal node, of all groups of all ranks, by point."""
     total = dofs.reduce(node_values, np.add)
     mean = total / dofs.multiplicity.reshape(-1, *[1] * (total.ndim - 1))
     points = np.concatenate(dofs.comm.allgather(group_points(dofs)))

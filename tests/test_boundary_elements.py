@@ -266,17 +266,10 @@ def test_a_change_of_modulus_and_of_load():
     elastic = tfeti.Elasticity(d, E=1.0, nu=0.3, model="plane_stress", thickness=0.1)
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     force = fem.Constant(d.mesh, (0.0, -0.1))
-    p = tfeti.ContactProblem(
-        elastic.a(u, v),
-        elastic.thickness * ufl.dot(force, v) * ufl.dx,
-        [clamp(V, d.facets("left"))],
-        [],
-        d,
-        stress=elastic.stress,
-        thickness=elastic.thickness,
-        petsc_options={"tfeti_rtol": 1e-10},
-        boundary_elements=ALL,
-    )
+    L = elastic.thickness * ufl.dot(force, v) * ufl.dx
+    given = {"stress": elastic.stress, "thickness": elastic.thickness, "boundary_elements": ALL}
+    bcs, options = [clamp(V, d.facets("left"))], {"tfeti_rtol": 1e-10}
+    p = tfeti.ContactProblem(elastic.a(u, v), L, bcs, [], d, petsc_options=options, **given)
     first = p.solve().x.array.copy()
     elastic.E.value = 2.0
     assert np.allclose(p.solve().x.array, first / 2, atol=1e-9)

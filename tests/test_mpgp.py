@@ -73,19 +73,6 @@ def test_mpgp_slides_sticks_and_falls_off():
     assert steps.proportioning > 0
 
 
-def test_the_cost_falls_in_each_step():
-    F, d, _, _, bounded, pairs, a = program(3, 2, True)
-    costs, feasible = [], as_set(bounded, pairs, a, True)
-    state = MprgpIterate(matrix(F), np.zeros(40), -d, feasible, MPI.COMM_SELF)
-
-    def stop(s):
-        costs.append(0.5 * float(s.x @ (s.g - d)))
-        return s.projected_gradient <= 1e-10
-
-    assert mprgp(state, MprgpParameters(1.0 / np.linalg.norm(F, 2)), stop, Steps(), 2000) is None
-    assert np.all(np.diff(costs) <= 1e-13 * np.abs(costs).max())
-
-
 def around_circles(seed, n=12):
     """F and d that push all of n discs outwards, in different directions."""
     rng = np.random.default_rng(seed)

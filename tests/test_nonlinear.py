@@ -354,8 +354,13 @@ def test_what_a_nonlinear_problem_does_not_take_is_named(comm):
     problem, _, _ = plastic(comm)
     with pytest.raises(tfeti.InputError, match="load and stiffness are those of linear problems"):
         problem.update(load=ufl.ZeroBaseForm((ufl.TestFunction(problem.u.function_space),)))
-    with pytest.raises(tfeti.InputError, match="rtol auto: it is for linear problems"):
-        plastic(comm, stress=lambda u: ufl.Identity(3) * u[0], petsc_options={"rtol": "auto"})
+    for said, given in {
+        "rtol auto: it is for linear problems": {"petsc_options": {"rtol": "auto"}},
+        "J2Plasticity, whose internal variables plastic_s": {"state": {}},
+        "state is that of a J2Plasticity, .* expected upd": {"update": None},
+    }.items():
+        with pytest.raises(tfeti.InputError, match=said):
+            plastic(comm, stress=lambda u: ufl.Identity(3) * u[0], **given)
     decomposition, u, v, *_ = small(comm)
     F, _ = of_neo_hooke(u, v)
     pressed = tfeti.Obstacle("low", tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0)), gap=-0.01)
@@ -373,13 +378,6 @@ def test_a_tangent_of_another_problem_is_named(comm):
     value.value[-1] = -0.1
     with pytest.raises(tfeti.ConvergenceError, match="J that is the derivative of F; along"):
         problem.solve()
-
-
-def test_a_law_without_its_state_or_its_update_is_named(comm):
-    with pytest.raises(tfeti.InputError, match="J2Plasticity, whose internal variables plastic_s"):
-        plastic(comm, state={})
-    with pytest.raises(tfeti.InputError, match="state is that of a J2Plasticity, .* expected upd"):
-        plastic(comm, update=None)
 
 
 def test_a_law_that_gives_no_number_is_named(comm):

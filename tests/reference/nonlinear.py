@@ -45,14 +45,8 @@ def block(gdim, n, bulge, comm=MPI.COMM_SELF):
 def above_plane(F, J, u, bcs, touching, up, starts):
     """Yield u for each start of a load step: F(u) = 0 where u_up + x_up ≥ 0 allows it.
 
-    Args:
-        F: Residual.
-        J: Its derivative.
-        u: The displacement, changed in place.
-        bcs: Dirichlet conditions.
-        touching: Nodes that may not go below 0.
-        up: The axis.
-        starts: Called before each step: set values, return nothing.
+    That is what nodes ``touching`` have to fulfil; J is F's derivative, u is changed in place, and
+    ``starts`` are called before each step.
     """
     V = u.function_space
     residual, jacobian = fem.form(F), fem.form(J)

@@ -240,14 +240,8 @@ def two_boxes(cell, traction, clamped, n_lower, n_upper, gap=0.0):
 def check_optimal(F, d, G, e, bounded, lam, share=1e-9, mu=None, pairs=(), axes=()):
     """Gλ = e and λ = P(λ − r(Fλ − d − Gᵀμ)): of min ½λᵀFλ − λᵀd only the minimiser fulfils it.
 
-    Args:
-        F, d, G, e: The program, dense.
-        bounded: Rows with λ ≥ 0.
-        lam: What was found.
-        share: Of its size that may be left.
-        mu: Multipliers of Gλ = e; None: what rows of no set say.
-        pairs: Rows of each ellipse or interval, shape (n, k).
-        axes: Its semi-axes, shape (n, k); 0 fixes a row.
+    λ ≥ 0 on rows ``bounded``, ``pairs`` of rows are in ellipses of semi-axes ``axes``, both of
+    shape (n, k), where 0 fixes a row; rows of no set say what μ is unless it is given.
     """
     s, pairs = F @ lam - d, np.asarray(pairs, dtype=int)
     if mu is None and len(e):
