@@ -144,10 +144,12 @@ def test_markers_name_surfaces_and_volumes(comm):
     mesh = dmesh.create_unit_square(comm, 8, 8)
     top = dmesh.locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[1], 1))
     tags = dmesh.meshtags(mesh, 1, np.sort(top), np.full_like(top, 7))
-    names = {"top": 7, "bottom": lambda x: np.isclose(x[1], 0)}
+    named = [("bottom", lambda x: np.isclose(x[1], 0)), ("right", lambda x: np.isclose(x[0], 1))]
+    names = dict(named[:: -1 if comm.rank == 1 else 1], top=7)  # ranks order them as they like
     left = {"left half": lambda x: x[0] <= 0.5}
     d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names, volumes=left)
-    assert (d.surface("top"), d.surface("bottom"), d.volume("left half")) == (7, 8, 1)
+    assert [d.surface(name) for name in ("top", "bottom", "right")] == [7, 8, 9]
+    assert d.volume("left half") == 1
     for name, at in (("top", 1.0), ("bottom", 0.0)):
         facets = d.facets(name)
         assert comm.allreduce(len(facets)) == 8

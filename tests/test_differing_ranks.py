@@ -240,7 +240,10 @@ CASES = {
         ),
         rf"contact is 1{ON}0 on rank 0",
     ),
-    "surfaces on others": (decomposed_on_one(surfaces={}), rf"surfaces: left is not given{ON}1 on"),
+    "surfaces on others": (
+        decomposed_on_one(surfaces={"left": lambda x: x[0] < 0.1}),
+        rf"surfaces: left is the callable <lambda>{ON}1 on",
+    ),
     "an extension on one": (
         lambda s, folder: s.problem(extensions=tfeti.Extensions(monitor=print) if ODD else None),
         rf"extensions: monitor is .*{ON}",

@@ -98,13 +98,13 @@ def decompose(
             given[what] = "not given" if tags is None else "given"
             if tags is not None:
                 check_tags(tags, mesh, of_cells, what, f"expected the {what} of the mesh given")
-        surfaces, facet_tags = _located(mesh, surfaces, facet_tags, "surfaces")
-        volumes, cell_tags = _located(mesh, volumes, cell_tags, "volumes")
-        surfaces = checked_names(surfaces, "surfaces", facet_tags, "facet_tags")
-        volumes = checked_names(volumes, "volumes", cell_tags, "cell_tags")
         number = subdomains if subdomains is None or is_whole(subdomains) else "for each cell"
         given |= {"surfaces": surfaces, "volumes": volumes, "number of subdomains": number}
         given["partitioner"] = partitioner
+    surfaces, facet_tags = _located(mesh, surfaces, facet_tags, "surfaces")
+    volumes, cell_tags = _located(mesh, volumes, cell_tags, "volumes")
+    surfaces = checked_names(surfaces, "surfaces", facet_tags, "facet_tags")
+    volumes = checked_names(volumes, "volumes", cell_tags, "cell_tags")
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
         untorn = _untorn(mesh, cell_tags, facet_tags, surfaces, volumes)
@@ -156,7 +156,8 @@ def _located(
     own = max([0, *taken, *([] if tags is None else tags.values.tolist())])
     tag = int(mesh.comm.allreduce(own, op=MPI.MAX))
     locate = dmesh.locate_entities_boundary if facets else dmesh.locate_entities
-    for name, marker in markers.items():
+    for name in mesh.comm.bcast(list(markers)):  # ranks may order them differently
+        marker = markers[name]
         with raised_on_all_ranks(mesh.comm), named(f"{what}[{name!r}]"):
             found = locate(mesh, dim, marker)
         if not any_rank(mesh.comm, len(found) > 0):
