@@ -62,8 +62,6 @@ class DualLimits:
 
 LIMITS = DualLimits()
 
-# --- The dual problem -------------------------------------------------------------------------
-
 # from B and c to the set of multipliers, on all local rows; rows of no set are free, and hold what
 # they multiply. A row's force is s_i λ_i (``Constraints.scale``, ``tangent_scale``)
 FeasibleLaw = Callable[[Constraints], FeasibleSet]

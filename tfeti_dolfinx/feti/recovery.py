@@ -84,9 +84,6 @@ def elastic_displacement(
     return response - subdomains.solve(subdomains.extended(constraints.forces(lam)))
 
 
-# --- Minimum-norm correction of constraint residuals ------------------------------------------
-
-
 def min_norm_correction(
     constraints: Constraints, w: Array, closed: Array, tol: float = 1e-10, max_it: int = 100
 ) -> Array:

@@ -184,9 +184,6 @@ def vector_from_vertices(dofs: TornDofs, values: Array, vertices: Array, name: s
     return function
 
 
-# --- The discretisation error -----------------------------------------------------------------
-
-
 class StressRecovery:
     """σ* − σ_h and ε* − ε_h, σ* and ε* recovered from the cells around each node.
 

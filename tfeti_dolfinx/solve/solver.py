@@ -30,8 +30,6 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
-# --- Choice and run of a solver ---------------------------------------------------------------
-
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
     "larger rtol, or a model with smaller ratios of stiffness or size",

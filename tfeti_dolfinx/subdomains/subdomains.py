@@ -81,16 +81,9 @@ class Subdomains:
     """The Blocks of a rank, one after the other.
 
     n, t and r are sums over this rank's Blocks: of their unknowns, of their trace unknowns and of
-    the dimensions of their kernels; b is the number of bodies of all ranks and k that of
-    candidate modes of each. A rank may have no Block.
-
-    Args:
-        blocks: This rank's Blocks, those of rigid bodies behind all others.
-        body_of_block: Body of each.
-        num_bodies: Number of bodies of all ranks.
-        comm: Communicator. The constructor is collective, and what its docstring calls so.
-        counters: Counts solves.
-        choice: Which form local operators take.
+    the dimensions of their kernels; b is the number of bodies of all ranks and k that of candidate
+    modes of each. A rank may have no Block. Blocks of rigid bodies stand behind all others.
+    Creation is collective, and what its docstring calls so.
 
     Attributes:
         elastic: The Blocks that have nodes, which are no rigid bodies, and num_nodal the number of
