@@ -5,7 +5,7 @@ import pytest
 import ufl
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
-from scenes import apart, clamp, curved_obstacle, decomposed, forms, hooke, strain
+from scenes import apart, curved_obstacle, decomposed, hooke, problem, strain
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, Saddle
@@ -28,22 +28,14 @@ def square(cells=16, parts=4, cell="quadrilateral", **options):
     """A square or cube of equal subdomains, clamped on the left, pressed on a curved obstacle."""
     d = decomposed(cell, cells, grid(parts))
     gdim = d.mesh.geometry.dim
-    traction = (0.0,) * (gdim - 1) + (-0.1,)
-    V, a, L = forms(d.mesh, d.facet_tags, traction, d.surface("top"))
-    return tfeti.ContactProblem(
-        a,
-        L,
-        [clamp(V, d.facets("left"))],
-        [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2)],
-        d,
-        petsc_options={f"tfeti_{name}": value for name, value in options.items()},
-    )
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2)
+    return problem(d, (0.0,) * (gdim - 1) + (-0.1,), [obstacle], **options)
 
 
-def solved(problem):
-    problem.solve()
-    u, report = problem.solution.u, problem.report
-    problem.destroy()
+def solved(p):
+    p.solve()
+    u, report = p.solution.u, p.report
+    p.destroy()
     return u, report
 
 
@@ -104,14 +96,14 @@ def test_the_answer_is_the_same(clusters, options):
 def test_two_bodies():
     """A cluster is of one body."""
 
-    def problem(**options):
+    def stack(**options):
         d = stacked("quadrilateral", subdomains=12)
         bcs = held(d, "lower bottom", "lower left")
         contact = [sided("upper bottom", "lower top")]
         return two_body_problem(d, pressed(d), bcs, contact, rtol=1e-9, **options)
 
-    u, _ = solved(problem())
-    v, report = solved(problem(clusters=2))
+    u, _ = solved(stack())
+    v, report = solved(stack(clusters=2))
     assert 2 <= report.clusters < report.subdomains
     assert apart(v, u) <= 1e-7
 
