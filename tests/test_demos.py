@@ -42,14 +42,6 @@ def test_help_says_nothing_of_petsc(serial_only, tmp_path):
     assert "WARNING" not in said
 
 
-def test_demos_run_with_smalse():
-    """Options reach their problems."""
-    options = ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none", "-tfeti_rtol", "1e-6"]
-    _, report = demos.run("hertz_2d", ["--quick", *options])
-    assert report.in_all["power_method_multiplications"] == 15
-    assert report.in_all["preconditioner_multiplications"] == 0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DEMOS)
 def test_default_size(name):

@@ -50,13 +50,6 @@ def test_every_solver_gives_the_same(pc_type, scaling, qp_type):
     assert relative(displacement(p)[1], expected) <= 1e-8
 
 
-@pytest.mark.parametrize("subdomains", [1, 17])
-def test_any_number_of_subdomains(subdomains):
-    p = problem(decomposed("tetrahedron", 4, subdomains), (0, 0, -0.05), tfeti_rtol=1e-11)
-    p.solve()
-    assert relative(displacement(p)[1], exact("tetrahedron", 4, (0, 0, -0.05))) <= 1e-9
-
-
 def test_patch_test():
     """Prescribed linear displacements on all sides give it everywhere, to solver tolerance."""
     d = decomposed("hexahedron", 4, 6)

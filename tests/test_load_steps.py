@@ -40,16 +40,6 @@ def test_a_block_pushed_and_pulled_back_slips_as_in_closed_form(cell):
     scene.problem.destroy()
 
 
-def test_without_accept_friction_acts_on_the_whole_slip():
-    scene, fresh = Sheared(), Sheared()
-    scene.top.value = 0.08
-    scene.problem.solve()
-    for item in (scene, fresh):
-        item.top.value = 0.02
-        item.problem.solve()
-    assert np.allclose(scene.problem.u.x.array, fresh.problem.u.x.array, rtol=0, atol=1e-9)
-
-
 def test_forces_over_load_steps_are_a_table(shared_tmp):
     """Pushed to and fro: no step dissipates less than nothing; forces and supports balance."""
     scene = Driven(rtol=1e-10)

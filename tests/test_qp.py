@@ -125,17 +125,6 @@ def test_pcpg_solves_the_saddle_point_system(seed):
     check_optimal(F, d, G, e, [], result.lam, 1e-10)
 
 
-def test_a_good_preconditioner_makes_pcpg_fast():
-    F, d, G, e, _ = random_program(1, n_bounded=0)
-    coarse = DenseCoarse(G, e)
-    plain = QP(matrix(F), vector(d), coarse, Product())
-    helped = QP(matrix(F), vector(d), coarse, Product(), matrix(np.linalg.inv(F)))
-    slow = solve_by_pcpg(plain, homogenise(plain), to(1e-10, homogenise(plain)))
-    fast = solve_by_pcpg(helped, homogenise(helped), to(1e-10, homogenise(helped)))
-    assert fast.steps.cg < slow.steps.cg / 2
-    assert np.allclose(slow.lam, fast.lam, atol=1e-8)
-
-
 def test_nothing_to_do_is_no_step():
     F, _, G, _, bounded = random_program(2)
     qp = QP(matrix(F), vector(np.zeros(40)), DenseCoarse(G, np.zeros(5)), bounds_on(bounded))
