@@ -79,6 +79,12 @@ def entries_at(row: Array, column: Array, value: Array, shape: tuple[int, int]) 
     return Entries(value[order], column[order], table, shape)
 
 
+def transposed(A: Any) -> Entries:
+    """Return Aᵀ of a CSR matrix."""
+    row = np.repeat(np.arange(A.shape[0]), np.diff(A.indptr))
+    return entries_at(A.indices, row, A.data, A.shape[::-1])
+
+
 def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
     """Return A[rows][:, columns] of a CSR matrix, columns ascending."""
     rows = np.arange(A.shape[0])[rows]

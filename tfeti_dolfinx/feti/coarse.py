@@ -8,7 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array, hstack
 
-from tfeti_dolfinx.common.arrays import Array, LocalMatrix, rows_times
+from tfeti_dolfinx.common.arrays import Array, LocalMatrix, rows_times, transposed
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
@@ -88,8 +88,8 @@ class CoarseSpace(Coarse):
             comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
         )
         self.motions = self._basis.coordinates(self.bodies.motions)
-        self.work = LocalMatrix(csr_array(self.motions.T)).__matmul__
-        self._directions = LocalMatrix(csr_array(self._basis.motions.T))
+        self.work = LocalMatrix(transposed(self.motions)).__matmul__
+        self._directions = LocalMatrix(transposed(self._basis.motions))
         Gt = self._basis.rows(Gt, rows_times(self.J, self.row_size), equalities)
         self.null = bcast_from_root(comm, orthonormal_columns(self.motions @ both))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)

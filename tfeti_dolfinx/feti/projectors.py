@@ -12,7 +12,7 @@ from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
-from tfeti_dolfinx.common.arrays import TINY, Array, Entries, LocalMatrix
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, LocalMatrix, transposed
 from tfeti_dolfinx.common.parallel import any_rank, joined_over, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
@@ -37,7 +37,7 @@ class Grams:
         self._always = np.ones(Gt.shape[0], dtype=bool)
         self._always[bounded] = False
         always = Gt[self._always]
-        base = replicated(always.T.tocsr() @ always, comm)
+        base = replicated(transposed(always).csr() @ always, comm)
         # 1. the entries that contact rows reach, on all ranks, and those of the whole
         parts = list(_blocks(Gt, bounded))
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
@@ -58,7 +58,7 @@ class Grams:
     @cached_property
     def G(self) -> csr_array:
         """This rank's columns of G, shape ``(r, m_local)``."""
-        return self.Gt.T.tocsr()
+        return transposed(self.Gt).csr()
 
     def of_face(self, face: Face, damping: float = 0.0) -> csr_array:
         """GZ(GZ)ᵀ + damping·GGᵀ, shape ``(r, r)``.

@@ -335,7 +335,7 @@ class KernelBasis:
     def coordinates(self, X: csr_array) -> csr_array:
         """T⁻¹X."""
         first = self.inverse @ X[self.pins]
-        left = csr_array(X - self.motions @ first)
+        left = X - self.motions @ first
         entries, table = entries_of_rows(left, self.rest)
         data = np.concatenate((first.data, left.data[entries]))
         columns = np.concatenate((first.indices, left.indices[entries]))
