@@ -385,7 +385,8 @@ def checked_target(
         beside = {".bp": f"{target.stem}_cells.bp", ".xdmf": f"{target.stem}.h5"}
         for name in (target, target.with_name(beside.get(suffix, target.name))):
             if name.is_dir() and any(name.iterdir()) and not (name / "md.idx").exists():
-                raise InputError(f"{name} is a directory that VTX has not written; expected a file")
+                whose = " that VTX has not written" if name.suffix == ".bp" else ""
+                raise InputError(f"{name} is a directory{whose}; expected a file")
     return target
 
 

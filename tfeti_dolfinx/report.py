@@ -23,6 +23,7 @@ from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
@@ -144,7 +145,7 @@ class ContactSummary:
         sticking: Nodes that stick.
         sliding: Nodes that slip.
         resultant: Force on that surface, friction included, ``gdim`` components.
-        pressure: The largest.
+        pressure: The largest of nodes of which the other side covers 2 % or more, if one touches.
         gap: The smallest, negative for an overlap.
     """
 
@@ -169,13 +170,15 @@ class ContactSummary:
         flags = [np.ones(len(of)), status != ContactStatus.OPEN, *kinds]
         own = np.column_stack((*flags, solution.condition_forces))
         sums = summed(comm, sum_rows(of, own, count))
-        extremes = np.full((2, count), -np.inf)
-        np.maximum.at(extremes[0], of, solution.contact_pressure)
-        np.maximum.at(extremes[1], of, -solution.remaining_gap)
+        hardly = (solution.gluing.records.covered < SEARCH.believed).astype(int)
+        extremes = np.full((3, count), -np.inf)
+        np.maximum.at(extremes, (hardly, of), solution.contact_pressure)
+        np.maximum.at(extremes[2], of, -solution.remaining_gap)
         comm.Allreduce(MPI.IN_PLACE, extremes, op=MPI.MAX)
         counts, forces = sums[:, :4].T.astype(int).tolist(), sums[:, 4:].tolist()
-        pressure = np.maximum(extremes[0], 0.0).tolist()  # of a contact without nodes it is 0
-        gaps = np.where(np.isfinite(extremes[1]), 0.0 - extremes[1], 0.0).tolist()
+        pressure, others, ends = np.where(np.isfinite(extremes), extremes, 0.0)
+        pressure = np.where(pressure > 0.0, pressure, np.maximum(others, 0.0)).tolist()
+        gaps = (0.0 - ends).tolist()
         names = [contact.name for contact in solution.contacts]
         columns: list[Any] = [names, *counts, forces, pressure, gaps]
         return [cls(*row) for row in zip(*columns, strict=True)]

@@ -19,6 +19,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import stretch_over_shear
@@ -107,10 +108,7 @@ class WarningLimits:
     # of what the largest pressure presses together: gaps that straight facets change by as much had
     # forces and pressures wrong by 4 to 10 %
     facets: float = 0.5
-    # share of a node's surface that the other side of a pair covers: pressures of nodes with less
-    # were 5 to 40 000 times those beside them, of blocks on flat faces
-    hardly_covered: float = 0.02
-    # such a pressure over the largest of other nodes; at edges they differ by less
+    # a pressure that is not believed over the largest of other nodes; at edges they differ by less
     stands_out: float = 2.0
     listed: int = 3  # bodies that a sentence names
 
@@ -336,7 +334,7 @@ def _untouched(outcome: Outcome, solution: Solution) -> Iterator[str]:
 
 
 def _hardly_covered(solution: Solution) -> Iterator[str]:
-    """Pairs whose largest pressure is on nodes that their primary side hardly covers. Collective.
+    """Pairs with large pressures on nodes that their primary side hardly covers. Collective.
 
     A force on the common part has a right resultant, but hats on a sliver are nearly linear: the
     forces on its vertices are large against their ∫φ_i on the sliver.
@@ -344,15 +342,15 @@ def _hardly_covered(solution: Solution) -> Iterator[str]:
     records, count = solution.gluing.records, len(solution.contacts)
     if all(len(contact.surfaces) == 1 for contact in solution.contacts):
         return
-    hardly = (records.covered < LIMITS.hardly_covered).astype(int)
+    hardly = (records.covered < SEARCH.believed).astype(int)
     most = np.zeros((2, count))
     np.maximum.at(most, (hardly, records.contact), solution.contact_pressure)
     solution.dofs.comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
     for i in np.flatnonzero(most[1] > LIMITS.stands_out * most[0]):
         yield (
-            f"{solution.contacts[i].name}: the largest pressure, {most[1, i]:.3g}, is at nodes of "
-            f"which the other side covers less than {LIMITS.hardly_covered:.0%}, elsewhere it is "
-            f"at most {most[0, i]:.3g}; forces are right, pressures of such nodes are not: "
+            f"{solution.contacts[i].name}: pressures go up to {most[1, i]:.3g} at nodes of which "
+            f"the other side covers less than {SEARCH.believed:.0%}, elsewhere they are at most "
+            f"{most[0, i]:.3g}; forces are right, pressures of such nodes are not: "
             "expected the other side as the secondary one, or a node where the other side ends"
         )
 
