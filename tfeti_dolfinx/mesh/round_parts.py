@@ -27,23 +27,18 @@ class RoundParameters:
     stages: tuple[tuple[float, int, float], ...] = (
         (300, 50, 0.5),
         (1000, 10, 0.5),
-        (np.inf, 5, 0.0),
+        (np.inf, 2, 0.0),
     )
     influence_step: float = 1.1  # factor by which a part's influence changes in a round at most
     # of the distance to the next centre, which a part's influence is at most
     influence: float = 0.8
-    candidates: int = 16  # parts that a point may join in a round, those nearest to its own
     fewest: int = 20  # cells of a part in the mean, below which parts are those of bisection
-    largest: float = 1.5  # size over the mean, above which round parts are not taken
     # weight of a facet over that of a vertex that a cell shares with another part
     facet: float = 12.0
     flattening: int = 10  # rounds in which cells change sides, until interfaces are flat
     # size over the mean, above which a part gains no cells where interfaces are flattened
     gains: float = 1.08
-    loses: float = 0.93  # size over the mean, below which it loses none
-    # bisection is tried where the ratio of a part's principal radii is at most so many times that
-    # of round parts
-    slender: float = 1.15
+    loses: float = 0.93  # and below which it loses none; between the two sizes are balanced
     bits: int = 20  # of the whole numbers that midpoints become along each axis
 
 
@@ -54,9 +49,8 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     """Part of each cell, by balanced k-means with smooth interfaces. Collective.
 
     Each body gets a share of the parts by its number of cells, and at least one. Bodies of flat
-    cells, and of few cells a part, get parts by bisection, whose cuts follow layers; and those
-    whose parts by bisection are neither more slender nor cut more facets, as boxes of a grid. Some
-    parts may not be connected. The parts do not depend on how ranks share the cells.
+    cells, and of few cells a part, get parts by bisection, whose cuts follow layers. Some parts may
+    not be connected. The parts do not depend on how ranks share the cells.
     """
     comm, bodies = graph.comm, graph.pieces(np.zeros(graph.num_cells, dtype=np.int64))
     body, sizes = bodies.of_cell, bodies.size
@@ -65,7 +59,7 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     flat = np.any(BISECTION.flat * extents <= extents.max(axis=1, initial=0.0)[:, None], axis=1)
     boxes = 2 * _counts(comm, body[flat], len(sizes)) > sizes
     boxes |= (sizes < ROUND.fewest * shares) | (shares == 1)
-    # integers, so that sums do not depend on how ranks share the cells
+    # integers, so that sums do not depend on how ranks share the points
     x = mesh.midpoints()
     low, high = box_over_ranks(comm, x)
     grid = np.rint((x - low) * (2.0**ROUND.bits / max(np.max(high - low), TINY)))
@@ -73,29 +67,15 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     for c in grid.T:
         key = mix(key ^ c.astype(np.uint64))
     home = np.repeat(np.arange(len(sizes)), shares)
-    wanted = (sizes / shares)[home]
-    rounded = ~boxes[body]
     part: Array = np.zeros(len(x), dtype=np.int64)
-    maybe = boxes.copy()
     if not np.all(boxes):
-        y, first = grid[rounded], np.cumsum(shares) - shares
-        found, begun = balanced_kmeans(y, key[rounded], body[rounded], shares, comm)
-        size = _counts(comm, found, len(home))
-        boxes[home[(size > ROUND.largest * wanted) | (size == 0)]] = True
-        part[rounded] = found
-        part = flatten_interfaces(graph, part, key, np.where(boxes[home], 0.0, wanted))
-        worst = np.maximum.reduceat(
-            np.stack((begun, _slenderness(y, found, len(home), comm))), first, axis=1
-        )
-        maybe = boxes | (worst[0] <= ROUND.slender * worst[1])
-    if np.any(maybe):
-        some, other = maybe[body], part.copy()
-        other[some] = bisect_points(x[some], shares, comm, extents[some], body=body[some])
-        of_parts = [graph.with_ghosts(p)[graph.across] != p[:, None] for p in (other, part)]
-        cuts = sum_rows(body, np.column_stack([cut.sum(axis=1) for cut in of_parts]), len(sizes))
-        boxes |= maybe & (np.diff(summed(comm, cuts), axis=1)[:, 0] >= 0.0)
-        part = np.where(boxes[body], other, part)
-    return part
+        some = ~boxes[body]
+        part[some] = balanced_kmeans(grid[some], key[some], body[some], shares, comm)
+        boxes[home[_counts(comm, part[some], len(home)) == 0]] = True
+    if np.any(boxes):
+        some = boxes[body]
+        part[some] = bisect_points(x[some], shares, comm, extents[some], body=body[some])
+    return flatten_interfaces(graph, part, key, np.where(boxes, 0.0, sizes / shares)[home])
 
 
 def _counts(comm: MPI.Intracomm, part: Array, num_parts: int) -> Array:
@@ -113,9 +93,7 @@ def _shares(weights: Array, num_parts: int) -> Array:
 # --- Balanced k-means: parts of round shape and equal size ------------------------------------
 
 
-def balanced_kmeans(
-    x: Array, key: Array, body: Array, shares: Array, comm: MPI.Intracomm
-) -> tuple[Array, Array]:
+def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.Intracomm) -> Array:
     """Balanced k-means of points, whole numbers ``(n, gdim)``, in so many parts a body. Collective.
 
     A point is in the part of its body with the least ‖x − c_k‖/w_k, the centre c_k being the mean
@@ -124,7 +102,7 @@ def balanced_kmeans(
     doi:10.1145/3225058.3225148). It is below the distance to the next centre: beyond that a small
     part, whose influence grows until it has points enough, soon has those of all around it. Cells
     stay where they are: sums travel. The keys, ``(n,)``, draw a sample, whose bisection is the
-    beginning. Return the part of each point, and how slender those of the bisection are.
+    beginning. Return the part of each point.
     """
     home = np.repeat(np.arange(len(shares)), shares)
     total, (n, gdim) = int(_counts(comm, body, len(shares)).sum()), x.shape
@@ -145,36 +123,23 @@ def balanced_kmeans(
             away = np.rint(np.sqrt(_squares(y, centre[own])))
             spread = summed(comm, sum_rows(own, away, len(home)))
             influence = np.maximum(spread / np.maximum(_counts(comm, own, len(home)), 1), 1.0)
-            begun = _slenderness(y, own, len(home), comm)
         else:
             own = centres().query(np.column_stack((y, apart * of)))[1].astype(np.int64)
             own = _nearest(y, own, centre, influence, home)
         goal = (_counts(comm, of, len(shares)) / shares)[home]
         for _ in range(rounds):
+            size = np.maximum(_counts(comm, own, len(home)), 1)
             if way:
                 centre += way * (_means(y, own, centre, comm) - centre)
-            size = np.maximum(_counts(comm, own, len(home)), 1)
+            elif np.all((size < ROUND.gains * goal) & (size > ROUND.loses * goal)):
+                break
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
             tree = centres()
             next_one = tree.query(tree.data, k=2)[0][:, 1]
             influence = np.minimum(influence, ROUND.influence * np.maximum(next_one, 1.0))
             own = _nearest(y, own, centre, influence, home)
-    return own, begun
-
-
-def _slenderness(x: Array, part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """Ratio of the largest and the smallest principal radius of each part."""
-    gdim = x.shape[1]
-    centre = _means(x, part, np.zeros((num_parts, gdim)), comm)
-    y = x - centre[part]
-    largest = np.zeros(num_parts)
-    np.maximum.at(largest, part, np.abs(y).max(axis=1, initial=0.0))
-    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    y = np.rint(y * (2.0**10 / np.maximum(largest, TINY))[part][:, None])  # sums are exact
-    squares = summed(comm, sum_rows(part, y[:, :, None] * y[:, None, :], num_parts))
-    radii = np.linalg.eigvalsh(squares)
-    return np.sqrt(radii[:, -1] / np.maximum(radii[:, 0], 2.0**-40 * radii[:, -1] + TINY))
+    return own
 
 
 def _means(x: Array, part: Array, before: Array, comm: MPI.Intracomm) -> Array:
@@ -194,19 +159,25 @@ def _squares(x: Array, c: Array) -> Array:
 
 
 def _nearest(x: Array, part: Array, centre: Array, influence: Array, home: Array) -> Array:
-    """Return the part with the least ‖x − c‖/w among those of its body near the present one."""
+    """Return the part of its body with the least ‖x − c_k‖/w_k for each point.
+
+    By the triangle inequality no other part j can have a point of part i with
+    ‖x − c_i‖/w_i < ‖c_i − c_j‖/(w_i + w_j).
+    """
     found, small = part.copy(), part.astype(np.min_scalar_type(len(centre)))
     order = np.argsort(small, kind="stable")  # of small integers by counting
     size = np.bincount(part, minlength=len(centre))
     present = np.flatnonzero(size)
-    parts = np.split(order, np.cumsum(size[present]))[:-1]
-    apart = np.sqrt(_squares(centre[present][:, None], centre))
-    apart /= influence[present][:, None] + influence
-    apart[home[present][:, None] != home] = np.inf
-    near: Array = np.argsort(apart, axis=1, kind="stable")[:, : ROUND.candidates]
-    reached = np.take_along_axis(apart, near, axis=1) < np.inf
-    for own, candidates, chosen in zip(parts, near, reached, strict=True):
-        joined = candidates[chosen]
+    bound = np.sqrt(_squares(centre[present][:, None], centre))
+    bound /= influence[present][:, None] + influence
+    bound[(home[present][:, None] != home) | (present[:, None] == np.arange(len(home)))] = np.inf
+    away = np.sqrt(_squares(x, centre[part])) / influence[part]
+    for k, own, away_from in zip(
+        present, np.split(order, np.cumsum(size[present]))[:-1], bound, strict=True
+    ):
+        own = own[away[own] >= away_from.min()]
+        reach = 1.001 * away[own].max(initial=0.0)  # what rounding decides is the same on all ranks
+        joined = np.append(k, np.flatnonzero(away_from <= reach))
         squares = _squares(x[own][:, None], centre[joined])
         found[own] = joined[np.argmin(squares / influence[joined] ** 2, axis=1)]
     return found
