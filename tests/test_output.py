@@ -9,7 +9,7 @@ from scenes import curved_obstacle, decomposed, largest, problem
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import InputError, TfetiError, draw
 from tfeti_dolfinx.output import cell_fields, nodal_fields, write_pvd, write_vtx, write_xdmf
-from tfeti_dolfinx.plot import check_screen, plot_deformed, plot_pressure
+from tfeti_dolfinx.plot import check_screen, plot_deformed, plot_friction, plot_pressure
 
 
 @pytest.fixture(scope="module", params=["quadrilateral", "tetrahedron"])
@@ -182,6 +182,8 @@ def test_pictures(solution, comm, shared_tmp):
 def test_a_colour_that_is_not_known_is_named(solution, shared_tmp):
     with pytest.raises(InputError, match=r"show='stress': expected one of von_mises, pressure"):
         plot_deformed(shared_tmp / "none.png", solution, show="stress")
+    with pytest.raises(InputError, match="no contact of the solution has friction"):
+        plot_friction(shared_tmp / "none.png", solution, lambda x: x[:, 0])
 
 
 def test_pyvista_has_the_bodies_without_tears(solution, comm):

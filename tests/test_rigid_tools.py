@@ -64,6 +64,8 @@ def test_a_tool_by_displacement_is_an_obstacle_that_lies_there(gdim):
     assert np.allclose(tool.resultant.force, -contact.resultant.force, rtol=1e-11)
     assert np.abs(moved.solution.contact(0).gap).max(initial=0.0) <= 1e-10
     assert moved.report.tools[0].startswith("punch: displacement (")
+    with pytest.raises(tfeti.InputError, match=r"tool 3: expected one of \['punch'\]"):
+        moved.solution.tool(3)
 
 
 def test_another_displacement_needs_neither_rows_nor_factors():
@@ -253,6 +255,7 @@ def test_load_steps_take_laws_of_time_and_write_a_table(tmp_path):
     records = steps.run()
     assert [r.tools["ball displacement y"] for r in records] == [-0.01, -0.02, -0.04]
     forces = [r.tools["ball force y"] for r in records]
+    assert problem.time == 1.0
     assert forces == sorted(forces)
     path = comm.bcast(str(tmp_path / "curve.csv"))
     steps.write_csv(path)

@@ -35,6 +35,7 @@ def of_untorn_function(s):
 
 
 BCS = {
+    r"bcs is a DirichletBC": lambda s: s.problem(bcs=s.clamp()),
     r"Dirichlet condition 1 is None; expected a dolfinx.fem.DirichletBC": lambda s: s.problem(
         bcs=[s.clamp(), None]
     ),
@@ -78,6 +79,7 @@ STRESS = {
         stress=lambda u: ufl.sym(ufl.grad(u))
     ),
     r"stress\(u\): ZeroDivisionError: no such place": lambda s: s.problem(stress=raising),
+    r"stress\(u\) is 1; expected a UFL tensor": lambda s: s.problem(stress=lambda u: 1),
 }
 
 OTHERS = {

@@ -72,6 +72,8 @@ THICKNESS = {
         thickness=0.5, model="axisymmetric"
     ),
     r"thickness=0: expected a positive number": lambda s: s.problem(thickness=0),
+    r"thickness is of shape \(2,\)": lambda s: s.problem(thickness=fem.Function(s.V)),
+    r"thickness has a test or trial function": lambda s: s.problem(thickness=s.v[0]),
 }
 
 TABLES = ("MODULI", "MODELS", "THICKNESS")

@@ -78,6 +78,7 @@ TAGS = {
 
 NAMES = {
     r"no surface 'lid' in the mesh; its surfaces are: 'left' \(1\)": lambda s: s.d.surface("lid"),
+    r"surface 1.5: expected the name or the tag of one surface": lambda s: s.d.surface(1.5),
 }
 
 MARKERS = {
