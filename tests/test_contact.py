@@ -109,17 +109,6 @@ def test_spheres_and_cylinders(shape):
     assert p.report.active_contacts > 0
 
 
-def test_two_obstacles_for_one_surface():
-    d = decomposed("hexahedron", 6, 4)
-    planes = [tfeti.Plane((0, 0, -0.02), (0.3, 0, 1)), tfeti.Plane((0, 0, -0.02), (-0.3, 0, 1))]
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", plane) for plane in planes])
-    p.solve()
-    assert p.report.contact_rows > 0
-    assert len(p.solution.contact(1).gap) == len(p.solution.contact(0).gap)
-    with pytest.raises(tfeti.InputError, match="contact 2: there are 2"):
-        p.solution.contact(2)
-
-
 def test_a_body_held_only_by_contact():
     d = decomposed("quadrilateral", 8, 6)
     corner = [

@@ -14,7 +14,7 @@ from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, Steps, StoppingRule, homogenise
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
 
@@ -101,19 +101,6 @@ def test_mprgp_reports_an_indefinite_operator():
     state = MprgpIterate(matrix(A), vector([1.0, 1.0]), vector([0.0, -2.0]), Product(), SELF)
     reason = mprgp(state, MprgpParameters(0.5), lambda s: False, Steps(), 10)
     assert reason == ConvergedReason.DIVERGED_INDEFINITE_MAT
-
-
-def test_smalse_from_the_solution_takes_hardly_a_step():
-    F, d, G, e, bounded = random_program(3)
-    coarse = DenseCoarse(G, e)
-    qp = QP(matrix(F), vector(d), coarse, bounds_on(bounded))
-    qp = replace(qp, norm=estimate_norm(qp.F, coarse, 60))
-    homogenised = homogenise(qp)
-    cold = smalse(qp, homogenised, to(1e-8, homogenised))
-    start = Start(cold.lam, cold.mu)
-    warm = smalse(qp, homogenised, to(1e-6, homogenised), start=start)
-    assert warm.steps.inner <= 2
-    assert np.linalg.norm(warm.lam - cold.lam) <= 1e-5 * np.linalg.norm(cold.lam)
 
 
 @given(st.integers(0, 1000))
