@@ -61,3 +61,25 @@ def test_pressures_are_judged_at_equal_errors(serial_only, tmp_path):
     assert [row["pressure"] for row in rows] == pytest.approx([0.08, 0.001] * 2, rel=0.02)
     assert equal[1]["1.0%"] == pytest.approx(5.0 * equal[0]["1.0%"], rel=0.01)
     assert (tmp_path / "peers.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_pressed_disc_is_judged_by_its_force(serial_only, monkeypatch):
+    """A coarse mesh presses as hard as the finest of the page, but for 2 %."""
+    monkeypatch.syspath_prepend(str(PEERS))
+    disc, n, finest = importlib.import_module("pressed_disc"), 8, 0.2527
+    points, cells = disc.quarter_disc(n)
+    area = np.linalg.det(np.diff(points[cells], axis=1)) / 2
+    assert np.all(area > 0.0)
+    assert area.sum() == pytest.approx(n * np.sin(np.pi / (2 * n)) / 2)
+    force, _, _ = disc.ours(points, cells)()
+    assert force == pytest.approx(finest, rel=0.02)
+    rows = []
+    for program, off in zip(disc.PROGRAMS, (1e-5, -1e-5), strict=True):
+        made = {"program": program, "seconds": len(program), "force": force}
+        finer = {"seconds": 9 * len(program), "force": finest * (1.0 + off)}
+        rows += [made, {**made, **finer}]
+    tables = disc.tables_of(rows)
+    errors = [row["error"] for row in tables["pressed half disc"]]
+    assert errors[1::2] == pytest.approx([1e-5, 1e-5], rel=1e-3)
+    seconds = [row["0.1%"] for row in tables["pressed half disc, seconds to an error"]]
+    assert seconds[0] / seconds[1] == pytest.approx(len(disc.NAME) / len("GetFEM"))
