@@ -61,7 +61,7 @@ def steps(cell, n, subdomains, mu, accepts, clamped, loaded, gap, loads, **optio
     return reports
 
 
-@pytest.mark.parametrize("seed", [*range(7), 13])  # 13 goes along a path of growing friction
+@pytest.mark.parametrize("seed", [*range(7), 69])  # 69 goes along a path of growing friction
 def test_random_steps(seed):
     assert all(reason == "CONVERGED_RTOL" for reason, _ in steps(*scene(seed)))
 
