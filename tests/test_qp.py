@@ -112,14 +112,6 @@ def test_pcpg_solves_the_saddle_point_system(seed):
     check_optimal(F, d, G, e, [], result.lam, 1e-10)
 
 
-def test_nothing_to_do_is_no_step():
-    F, _, G, _, bounded = random_program(2)
-    qp = QP(matrix(F), vector(np.zeros(40)), DenseCoarse(G, np.zeros(5)), bounds_on(bounded))
-    homogenised = homogenise(qp)
-    assert smalse(qp, homogenised, StoppingRule(0.0)).steps.inner == 0
-    assert solve_by_pcpg(qp, homogenised, StoppingRule(0.0)).steps.cg == 0
-
-
 @pytest.mark.parametrize("M", [1e6, 1e-6])
 def test_smalse_says_that_nothing_fulfils_the_equality(M):
     """λ ≥ 0 and λ_1 + λ_2 = −√2 exclude each other."""

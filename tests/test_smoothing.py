@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mpi4py import MPI
 from numpy.polynomial.chebyshev import Chebyshev
-from scenes import box, decomposed, forms, problem
+from scenes import box, forms
 from scipy.linalg import block_diag
-from test_own_block import DenseBlock
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
@@ -104,17 +103,3 @@ def test_the_preconditioner_is_what_its_formula_says(dual, kappa, serial_only):
     found = dense(M, len(dual.d))
     assert np.abs(found - expected).max() <= 2e-3 * np.abs(expected).max()
     assert np.allclose(found, found.T, atol=1e-10 * np.abs(found).max())
-
-
-@pytest.mark.parametrize(
-    ("options", "extensions"),
-    [
-        ({"tfeti_pc_type": "lumped"}, None),
-        ({"tfeti_pc_type": "dirichlet"}, tfeti.Extensions(block=DenseBlock)),
-    ],
-)
-def test_only_sparse_blocks_and_S_have_a_metric(options, extensions):
-    d = decomposed("hexahedron", 3, 4)
-    p = problem(d, extensions=extensions, **options)
-    assert dual_of(p).preconditioner.metric is None
-    p.destroy()
