@@ -36,7 +36,7 @@ class Scene:
     """A square, clamped on the left, above a floor; parts of the decomposition are made once."""
 
     def __init__(self):
-        self.d = decomposed("quadrilateral", 3, 2)
+        self.d = decomposed("quadrilateral", 3, 4)
         self.V, self.a, _ = forms(self.d.mesh, self.d.facet_tags, (0, 0), self.d.surface("top"))
         self.v = self.a.arguments()[0]
 
