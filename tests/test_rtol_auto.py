@@ -12,7 +12,7 @@ from tfeti_dolfinx.feti.stopping import StoppingTolerances
 def work(p):
     """Multiplications by F and S, and what as much is done for looks."""
     r = p.report
-    looks = r.recoveries + r.estimates.get("lifting_steps", 0)
+    looks = r.recoveries + r.estimates.get("lifting_multiplications", 0)
     return r.F_multiplications + r.preconditioner_multiplications + looks
 
 

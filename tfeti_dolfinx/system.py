@@ -445,7 +445,6 @@ class System:
 
     def _factor(self) -> None:
         dofs, trace = self._dofs, self.gluing.constraints.trace
-        self._equals.follows = self.follows
         self._subdomains = self._settings.make_subdomains(
             subdomain_data(dofs, dofs.decomposition, self._K, self._f, trace),
             dofs,

@@ -34,7 +34,7 @@ class Estimates:
             None if the problem was given no stress. ``Solution.discretisation_error`` has its
             parts.
         factorizations: Subdomain matrices factored for it.
-        lifting_steps: Applications of S, the Schur complements.
+        lifting_multiplications: Applications of S, the Schur complements.
         recoveries: Displacements recovered, each for one more solve in every subdomain.
         seconds: Wall seconds of this rank.
     """
@@ -43,7 +43,7 @@ class Estimates:
     algebraic: float
     discretisation: float | None
     factorizations: int
-    lifting_steps: int
+    lifting_multiplications: int
     recoveries: int
     seconds: float
 
@@ -85,7 +85,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
         algebraic=bound.error,
         discretisation=float(discretisation) if solution.has_stress else None,
         factorizations=comm.allreduce(counters.factorizations - factored),
-        lifting_steps=1,
+        lifting_multiplications=1,
         recoveries=int(bound.moved > 0.0),
         seconds=perf_counter() - start,
     )
@@ -113,6 +113,6 @@ def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
         "energy": last.energy,
         "algebraic": last.bound.error,
         "discretisation": last.goal,
-        "lifting_steps": len(reached),
+        "lifting_multiplications": len(reached),
         "recoveries": sum(look.bound.moved > 0.0 for look in reached),
     }

@@ -391,7 +391,7 @@ class ContactDynamics(ContactProblem):
         """Put energies, work and forces into the report."""
         motion = balance(self._forms_in_time, self._system.dual, self.solution)
         if self._predictor is not None:
-            motion["predictor_iterations"] = float(self._predictor.multiplications)
+            motion["predictor_multiplications"] = float(self._predictor.multiplications)
         contact, forces = self.solution.gluing.records.contact, self.solution.condition_forces
         total = summed(self.dofs.comm, sum_rows(contact, forces, len(self.contacts)))
         means = [[float(component) for component in force] for force in total]

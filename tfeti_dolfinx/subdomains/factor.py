@@ -53,51 +53,29 @@ class CholeskyFactor:
 
     Creation raises a NotPositiveDefiniteError where A is not positive definite; a FactorError where
     there is no memory for the factor, PETSc has no such solver, or it fails. A is a matrix of scipy
-    or ``Entries``, both triangles, and may go after it, unless matrices of the same entries follow;
-    PETSc's options ``pc_factor_...`` and ``mat_...`` with the prefix are heeded.
+    or ``Entries``, both triangles, and may go after it; PETSc's options ``pc_factor_...`` and
+    ``mat_...`` with the prefix are heeded.
     """
 
-    def __init__(self, A: Any, prefix: str = "tfeti_sub_", follows: bool = False) -> None:
+    def __init__(self, A: Any, prefix: str = "tfeti_sub_") -> None:
         matrix, pc = as_petsc_matrix(A), PETSc.PC().create(PETSc.COMM_SELF)
         # not SPD, which is what the factor is to find out; MUMPS would not look at signs then
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._b, self._x = matrix.createVecs()
-        self._prefix = prefix
         self._factor: Any = None
-        self._made_of = (pc, matrix, A) if follows else None
-        self._make(pc, matrix)
-
-    def _make(self, pc: PETSc.PC, matrix: PETSc.Mat) -> None:
         try:
-            self._factor = _factored(pc, matrix, self._prefix)
+            self._factor = _factored(pc, matrix, prefix)
             _check_definite(self._factor)
             if not np.all(np.isfinite(self.solve(np.ones(self._b.getLocalSize())))):
                 raise NotPositiveDefiniteError("a pivot is zero")
         except (PETSc.Error, FactorError) as error:
             # PETSc knows no package yet where it could not read an option
-            solver = pc.getFactorSolverType() or f"PETSc, with options -{self._prefix}...,"
-            self._factor = self._made_of = None  # the error holds this object
+            solver = pc.getFactorSolverType() or f"PETSc, with options -{prefix}...,"
+            self._factor = None  # the error holds this object
             raise _cause(error, solver, matrix) from error
         finally:
-            if self._made_of is None:
-                pc.destroy()
-                matrix.destroy()
-
-    def follow(self, A: Any) -> bool:
-        """Become the factor of another matrix, in the same order of elimination, or return False.
-
-        That is where A has other entries than the matrix before. It raises what creation does.
-        """
-        if self._made_of is None:
-            return False
-        pc, matrix, before = self._made_of
-        pairs = (before.indptr, A.indptr), (before.indices, A.indices)
-        if not all(np.array_equal(old, new) for old, new in pairs):
-            return False
-        before.data[:] = A.data
-        matrix.stateIncrease()
-        self._make(pc, matrix)
-        return True
+            pc.destroy()
+            matrix.destroy()
 
     @property
     def entries(self) -> float:
@@ -189,15 +167,12 @@ def say_if_not_cholmod() -> None:
 
 def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
     """Return the factor of a matrix, by PETSc's options with a prefix."""
-    if pc.getType() is None:
-        pc.setOptionsPrefix(prefix)
-        pc.setType(PETSc.PC.Type.CHOLESKY)
-        pc.setOperators(matrix)
-        given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
-        with added_options(prefix, given):
-            pc.setFromOptions()
-            pc.setUp()
-    else:  # of other numbers: what was found of its entries stays
+    pc.setOptionsPrefix(prefix)
+    pc.setType(PETSc.PC.Type.CHOLESKY)
+    pc.setOperators(matrix)
+    given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
+    with added_options(prefix, given):
+        pc.setFromOptions()
         pc.setUp()
     reason = pc.getFailedReason()
     if reason == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:

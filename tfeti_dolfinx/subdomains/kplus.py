@@ -47,25 +47,14 @@ class GeneralisedInverse(Protocol):
 MakeInverse = Callable[[Any, Array, Array, str], GeneralisedInverse]
 
 
-def regularised(
-    K: Any,
-    R: Array,
-    fixing_dofs: Array,
-    prefix: str = "tfeti_sub_",
-    last: CholeskyFactor | None = None,
-    follows: bool = False,
-) -> CholeskyFactor:
+def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> CholeskyFactor:
     """Factor K_ρ = K + ρ Nᵀ(NNᵀ)⁻¹N, N the kernel on a few fixing unknowns, ρ = max diag K.
 
     K_ρ⁻¹ is an exact generalised inverse, because N R is regular (Brzobohatý, Dostál, Kozubek,
     Kovář, Markopoulos, IJNME 88, 2011, section 4). Raise a NotPositiveDefiniteError where K_ρ has
-    no Cholesky factor; a FactorError where it could not be made for another reason. ``last``, the
-    factor of a stiffness that K follows, becomes it where it can; ``follows``: others follow K.
+    no Cholesky factor; a FactorError where it could not be made for another reason.
     """
-    matrix = regular_matrix(K, R, fixing_dofs)
-    if last is not None and last.follow(matrix):
-        return last
-    return CholeskyFactor(matrix, prefix, follows)
+    return CholeskyFactor(regular_matrix(K, R, fixing_dofs), prefix)
 
 
 def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
@@ -79,10 +68,15 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     # what moves in no motion may be far stiffer
     moves = np.abs(R).max(axis=1) > TOLERANCES.still * np.abs(R).max()
     added = K.diagonal()[moves].max() * (Q @ Q.T)
+    # behind the entries of these rows, and then summed up
     count = len(fixing_dofs)
-    table = count * np.searchsorted(fixing_dofs, np.arange(len(K.indptr)))
-    columns = np.tile(fixing_dofs.astype(K.indices.dtype), count)
-    return K + csr_array((added.ravel(), columns, table.astype(K.indptr.dtype)), shape=K.shape)
+    at = np.repeat(K.indptr[fixing_dofs + 1], count)
+    columns = np.insert(K.indices, at, np.tile(fixing_dofs, count))
+    table = K.indptr + count * np.searchsorted(fixing_dofs, np.arange(len(K.indptr)))
+    result = csr_array((np.insert(K.data, at, added.ravel()), columns, table), shape=K.shape)
+    result.sum_duplicates()
+    result.eliminate_zeros()
+    return result
 
 
 @dataclass(frozen=True)

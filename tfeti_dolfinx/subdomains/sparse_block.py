@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,7 +43,6 @@ class Stiffness:
     Equal subdomains share one; it lives as long as one of them uses it. Creation raises an
     InputError where K is not symmetric, not finite or not positive semidefinite; a FactorError
     where a factor could not be made. K is scipy CSR, shape ``(n, n)``, and becomes its own.
-    ``follows``: others follow, as tangents do, for which orders of elimination are kept.
 
     Attributes:
         kernel: R, shape ``(n, r)``.
@@ -51,36 +50,20 @@ class Stiffness:
         entries: Entries of the factor; of an inverse that the user brings, as if it were dense.
     """
 
-    def __init__(
-        self, name: str, x: Array, K: Any, how: InverseFactory, follows: bool = False
-    ) -> None:
-        self.name, self.how, self.follows = name, how, follows
+    def __init__(self, name: str, x: Array, K: Any, how: InverseFactory) -> None:
+        check_stiffness(name, K)
+        self.name, self.x, self.K, self.how = name, x, K, how
         self.size = int(K.shape[0])
         self.bs = self.size // max(len(x), 1)
         self._traced: WeakValueDictionary[bytes, Traced] = WeakValueDictionary()
-        self._fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
-        self._pinv: GeneralisedInverse | None = None
-        self.take(x, K)
-
-    def take(self, x: Array, K: Any) -> None:
-        """Take another K of the same unknowns, whose factors keep what they share with the last."""
-        check_stiffness(self.name, K)
-        self.x, self.K, how, name = x, K, self.how, self.name
-        for known in (self, *self._traced.values()):
-            for made in ("product", "stretch_over_shear", "stiffness", "coupling", "inner"):
-                known.__dict__.pop(made, None)
         centre = x.mean(axis=0)
         length = np.linalg.norm(x - centre, axis=1).max()
         self.diagonal = K.diagonal()
         self.kernel = R = kernel_of(K, candidate_modes(x, self.bs, centre, length))
         how.counters.factorizations += 1
-        fixing = self._fixing
+        fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
-            if how.kplus is regularised:
-                last = self._pinv if isinstance(self._pinv, CholeskyFactor) else None
-                self._pinv = regularised(K, R, fixing, how.prefix, last, self.follows)
-            else:
-                self._pinv = how.kplus(K, R, fixing, how.prefix)
+            self._pinv: GeneralisedInverse = how.kplus(K, R, fixing, how.prefix)
             self.entries = self.size**2 / 2.0
             if isinstance(self._pinv, CholeskyFactor):
                 self.entries = self._pinv.entries
@@ -92,7 +75,6 @@ class Stiffness:
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)`` or ``(n, q)``."""
-        assert self._pinv is not None
         if b.ndim == 1 or isinstance(self._pinv, CholeskyFactor):
             return self._pinv.solve(b)
         # an inverse that the user brings may know single vectors only
@@ -122,7 +104,6 @@ class Traced:
     def __init__(self, stiffness: Stiffness, trace: Array) -> None:
         self._of, self.trace = stiffness, trace
         self.inside = np.setdiff1d(np.arange(stiffness.size), trace, assume_unique=True)
-        self._last: CholeskyFactor | None = None
 
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
@@ -142,10 +123,6 @@ class Traced:
         return LocalMatrix(entries_within(self._of.K, self.inside, self.trace))
 
     @cached_property
-    def _fixing(self) -> Array:
-        return fixing_dofs(self._of.x, self.inside // self._of.bs)
-
-    @cached_property
     def inner(self) -> CholeskyFactor | None:
         """K_ii⁺; K_ii is singular where the trace leaves a motion free, say normal rows only.
 
@@ -160,11 +137,8 @@ class Traced:
         how, K_ii = stiffness.how, entries_within(stiffness.K, inside, inside)
         how.counters.factorizations += 1
         try:
-            K_ii = K_ii.csr() if R.shape[1] else K_ii
-            self._last = regularised(
-                K_ii, R, self._fixing, how.prefix, self._last, stiffness.follows
-            )
-            return self._last
+            fixing = fixing_dofs(stiffness.x, inside // stiffness.bs)
+            return regularised(K_ii.csr() if R.shape[1] else K_ii, R, fixing, how.prefix)
         except FactorError as error:
             raise FactorError(
                 f"{stiffness.name}: the stiffness of the unknowns that no constraint touches, for "
@@ -210,30 +184,21 @@ EQUAL = EqualityTolerances()
 
 
 class EqualSubdomains:
-    """The stiffnesses of a rank, each held once; ``kept`` are those that ``keep`` holds.
-
-    Attributes:
-        follows: Whether stiffnesses follow each other, as tangents do.
-    """
-
-    follows = False
+    """The stiffnesses of a rank, each held once; ``kept`` are those that ``keep`` holds."""
 
     def __init__(self, how: InverseFactory) -> None:
         self._how = how
         self._of_shape: dict[bytes, WeakSet[Stiffness]] = defaultdict(WeakSet)
         self.kept: dict[str, tuple[Stiffness, Traced | None]] = {}
-        self._alone: set[int] = set()  # kept ones that one subdomain has had, and none has taken
 
     def keep(self, blocks: Sequence[Block]) -> None:
         """Hold the stiffnesses of Blocks, with their factors, for those that come after them.
 
-        One is let go as soon as the subdomain of its name has another, or becomes that.
+        One is let go as soon as the subdomain of its name has another.
         """
         for block in blocks:
             if isinstance(block, SparseBlock) and block.equals is self:
                 self.kept[block.name] = (block.stiffness, block.__dict__.get("traced"))
-        users = Counter(id(stiffness) for stiffness, _ in self.kept.values())
-        self._alone = {one for one, count in users.items() if count == 1}
 
     def find(self, name: str, x: Array, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness that is equal to K, or a new one; and where K's unknowns are in it.
@@ -242,27 +207,17 @@ class EqualSubdomains:
         """
         bs = K.shape[0] // len(x)
         shape, nodes = places_in_order(x)
-        known = bytes([bs]) + shape
-        for stiffness in self._of_shape[known]:
+        known = self._of_shape[bytes([bs]) + shape]
+        for stiffness in known:
             its_nodes, place = places_in_order(stiffness.x)[1], np.empty_like(nodes)
             place[nodes] = its_nodes
             here = (place[:, None] * bs + np.arange(bs)).ravel().astype(np.int32)
             if _equal(K, stiffness, here):
-                self._alone.discard(id(stiffness))
                 return stiffness, here
             del stiffness
-        kept = self.kept.pop(name, None)
-        if self.follows and kept is not None and id(kept[0]) in self._alone:
-            made, self.kept[name] = kept[0], kept
-            before = bytes([bs]) + places_in_order(made.x)[0]
-            self._of_shape[before].discard(made)
-            if not self._of_shape[before]:
-                del self._of_shape[before]
-            made.take(x, K)
-        else:
-            kept = None  # its factors go before others are made
-            made = Stiffness(name, x, K, self._how, self.follows)
-        self._of_shape[known].add(made)
+        self.kept.pop(name, None)  # its factors go before others are made
+        made = Stiffness(name, x, K, self._how)
+        known.add(made)
         return made, np.arange(K.shape[0], dtype=np.int32)
 
 
