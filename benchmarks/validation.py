@@ -413,12 +413,12 @@ def plastic_indentation(scale: float) -> Iterator[Row]:
         if depth in figures:
             slip, other, allowed = figures[depth]
             force = contact_force(problem) / (2 * pi)
-            for whose, figure, limit in (
+            for whose, published, limit in (
                 ("slip lines", slip, allowed),
                 ("Code_Aster", other, None),
             ):
                 at = f"force at {depth:.0f}, {whose}"
-                yield figure(case, at, figure, force, limit, problem, total)
+                yield figure(case, at, published, force, limit, problem, total)
 
 
 def thick_cylinder(scale: float) -> Iterator[Row]:
