@@ -12,6 +12,8 @@ from tfeti_dolfinx.mortar.facets import group_points
 SIDES_2D = {"left": (0, 0.0), "right": (0, 1.0), "bottom": (1, 0.0), "top": (1, 1.0)}
 SIDES_3D = {**SIDES_2D, "bottom": (2, 0.0), "top": (2, 1.0), "front": (1, 0.0), "back": (1, 1.0)}
 SIDES = {2: SIDES_2D, 3: SIDES_3D}
+# stages of a solve, as reports and -log_view name them
+STAGES = ["mesh", "contact", "constraints", "assembly", "factors", "coarse", "solve", "recovery"]
 
 
 def tagged(mesh, parts):

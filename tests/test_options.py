@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from petsc4py import PETSc
 from quick_demos import alone, process
-from scenes import decomposed, problem
+from scenes import STAGES, decomposed, problem
 
 from tfeti_dolfinx import InputError, Options
 from tfeti_dolfinx.common.validation import parameters_of
@@ -123,15 +123,6 @@ def test_the_command_line_of_a_program(serial_only, tmp_path):
     command = [sys.executable, path, "--quick", "-tfeti_converged_reason", "-log_view"]
     said = process(command, tmp_path, environment)
     assert "TFETI solve CONVERGED_RTOL" in said
-    for name in (
-        "mesh",
-        "contact",
-        "constraints",
-        "assembly",
-        "factors",
-        "coarse",
-        "solve",
-        "recovery",
-    ):
+    for name in STAGES:
         assert f"tfeti: {name}" in said
     assert "unused database" not in said

@@ -4,7 +4,7 @@ import json
 from dataclasses import fields
 
 import pytest
-from scenes import curved_obstacle, decomposed, problem
+from scenes import STAGES, curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import Report
@@ -30,17 +30,7 @@ def test_sizes(report):
 
 
 def test_every_stage_has_its_seconds(report):
-    stages = {
-        "mesh",
-        "contact",
-        "constraints",
-        "assembly",
-        "factors",
-        "coarse",
-        "solve",
-        "recovery",
-    }
-    assert set(report.seconds) == stages | {"total"}
+    assert set(report.seconds) == {*STAGES, "total"}
     assert all(value >= 0.0 for value in report.seconds.values())
     total = sum(value for name, value in report.seconds.items() if name != "total")
     assert report.seconds["total"] == pytest.approx(total, rel=0.2)
