@@ -246,8 +246,8 @@ class NonlinearContactProblem(ContactProblem):
         off, size = np.sqrt(self._total(np.array([apart @ apart, along @ along])))
         if self._has_own_tangent and off > tol.another * size:
             return (
-                f"a tangent J that is the derivative of F; along the last step they differ by "
-                f"{off / size:.1e} of J"
+                "a tangent J that is the derivative of F, as J2Plasticity.tangent(w, v) is that of "
+                f"its residual; along the last step they differ by {off / size:.1e} of J"
             )
         return "smaller load steps"
 
