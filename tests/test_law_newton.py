@@ -32,7 +32,7 @@ class DenseOblique:
 
     def __init__(self, G, face, C):
         self.ZZ = (face.Z @ face.Z.T).toarray()
-        self.follows = G @ (np.eye(G.shape[1]) + C.toarray()) @ self.ZZ
+        self.follows = G @ (self.ZZ + C @ self.ZZ)
         self.Gt = self.ZZ @ G.T
         self.H = np.linalg.pinv(self.follows @ G.T)
 

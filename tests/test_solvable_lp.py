@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
-from tfeti_dolfinx.feti.rigid_bodies import gram_of, unresisted, unsprung
+from tfeti_dolfinx.feti.rigid_bodies import BodyRows, unresisted, unsprung
 from tfeti_dolfinx.feti.solvability import RigidScene
 
 
@@ -34,7 +34,7 @@ def rigid_scene(rng):
 
 
 def gram(J, count, k):
-    return gram_of(csr_array(J), np.ones(len(J), dtype=bool), count, k)
+    return BodyRows.of(csr_array(J), count, k).gram(np.ones(len(J), dtype=bool))
 
 
 def escape(count, k, E, N, load):

@@ -79,6 +79,13 @@ def entries_at(row: Array, column: Array, value: Array, shape: tuple[int, int]) 
     return Entries(value[order], column[order], table, shape)
 
 
+def rows_of(A: Any, rows: Array, factors: Array | float = 1.0) -> Entries:
+    """Return diag(factors) A[rows] of a CSR matrix."""
+    entries, table = entries_of_rows(A, rows)
+    data = A.data[entries] * np.repeat(np.broadcast_to(factors, len(rows)), np.diff(table))
+    return Entries(data, A.indices[entries], table, (len(rows), A.shape[1]))
+
+
 def transposed(A: Any) -> Entries:
     """Return Aᵀ of a CSR matrix."""
     row = np.repeat(np.arange(A.shape[0]), np.diff(A.indptr))
@@ -95,6 +102,18 @@ def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
     kept = column >= 0
     table = np.concatenate(([0], np.cumsum(kept)))[table]
     return Entries(A.data[entries[kept]], column[kept], table, (len(rows), len(columns)))
+
+
+def beside(A: Entries, B: Entries) -> Entries:
+    """Return [A, B]."""
+    parts = np.diff(A.indptr), np.diff(B.indptr)
+    table = A.indptr + B.indptr
+    of_A = np.arange(len(A.data)) + np.repeat(B.indptr[:-1], parts[0])
+    of_B = np.arange(len(B.data)) + np.repeat(A.indptr[1:], parts[1])
+    data, indices = np.empty(table[-1]), np.empty(table[-1], dtype=np.int64)
+    data[of_A], data[of_B] = A.data, B.data
+    indices[of_A], indices[of_B] = A.indices, A.shape[1] + B.indices
+    return Entries(data, indices, table, (A.shape[0], A.shape[1] + B.shape[1]))
 
 
 def as_petsc_matrix(A: Any) -> PETSc.Mat:

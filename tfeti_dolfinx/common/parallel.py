@@ -19,6 +19,8 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
     ranks that decide by their own floats may part ways. Numbers and flags travel as a buffer; all
     ranks pass the same type.
     """
+    if comm.size == 1:
+        return value
     if isinstance(value, bool | float | np.bool_ | np.floating):
         number = np.array([float(value)])
         comm.Bcast(number, root=0)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array, hstack
+from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array, LocalMatrix, rows_times, transposed
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
@@ -21,13 +22,14 @@ from tfeti_dolfinx.feti.projectors import (
 from tfeti_dolfinx.feti.rigid_bodies import (
     TOLERANCES,
     Bodies,
+    BodyRows,
     Motions,
-    gram_of,
     kernel_basis,
     orthonormal_columns,
     unresisted,
 )
 from tfeti_dolfinx.qp.coarse import Coarse
+from tfeti_dolfinx.qp.friction_newton import Following
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -42,14 +44,13 @@ class CoarseSpace(Coarse):
     Attributes:
         dimension: r, the dimension of the kernel of K.
         e: (R T)ᵀ f, shape ``(r,)``.
-        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``; ``work``
-            is the product of their transpose with an r-vector.
+        motions: The bodies' motions in the basis T; ``work`` is the product of their transpose with
+            an r-vector.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
             row over it gives lengths. Shape ``(m_local,)``.
         bodies: Motions of the bodies.
-        J: This rank's rows of B R over their size, on motions of bodies, scipy CSR, shape
-            ``(m_local, bodies * k)``; empty for gluing rows.
+        J: This rank's rows of B R over their size, on motions of bodies; empty for gluing rows.
         unheld: Motions that neither springs nor equality rows resist, friction apart; each of
             these rows acts on one body.
         free_motions: Motions that no row resists at all.
@@ -76,22 +77,23 @@ class CoarseSpace(Coarse):
         Gt = transposed_G(B, kernel, dimension)
         self.row_size = _sizes(B)
         self.bodies = Bodies(subdomains)
-        self.J = _without_rounding(rows_times(Gt, 1.0 / self.row_size) @ self.bodies.motions)
+        self.J = self._on_bodies(Gt)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[np.concatenate((bounded, rubbing))] = False
         self.unheld = self.unresisted(equalities, self.bodies.unsprung)
         self.free_motions = self.unresisted(~equalities)
-        both = hstack([self.free_motions.alone, self.free_motions.joint], format="csr")
+        both = self.free_motions.columns
         self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
         # made on one rank: processors that round differently might choose differently
         self._basis = bcast_from_root(
             comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
         )
-        self.motions = self._basis.coordinates(self.bodies.motions)
-        self.work = LocalMatrix(transposed(self.motions)).__matmul__
-        self._directions = LocalMatrix(transposed(self._basis.motions))
-        Gt = self._basis.rows(Gt, rows_times(self.J, self.row_size), equalities)
-        self.null = bcast_from_root(comm, orthonormal_columns(self.motions @ both))
+        self.motions = self._basis.coordinates
+        self.work = self.motions.transposed
+        rows = replace(self.J, parts=self.J.parts * self.row_size[self.J.row, None])
+        Gt = self._basis.rows(Gt, rows, equalities)
+        null = self.motions.csr() @ both if both.shape[1] else csr_array((dimension, 0))
+        self.null = bcast_from_root(comm, orthonormal_columns(null))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, NullModes(self.null), prefix)
         self.factor = self.factors.factor(self.grams.whole, "whole")
@@ -104,7 +106,24 @@ class CoarseSpace(Coarse):
         if not self.dimension:
             return np.zeros(0)
         e = joined_over(self.comm, self.subdomains.kernel_load)
-        return np.concatenate((self._directions @ e, e[self._basis.rest]))
+        return self._basis.transposed(e)
+
+    def _on_bodies(self, Gt: csr_array) -> BodyRows:
+        """Return the rows of B R over their size on motions of bodies, without what is rounding.
+
+        Points far from the origin have more of it than motions, but all rows that do not only glue
+        act on translations with about their size.
+        """
+        J = Gt @ self.bodies.motions.csr()
+        counts = np.diff(J.indptr)
+        row = np.repeat(np.arange(len(counts)), counts)
+        J.data /= self.row_size[row]
+        largest: Array = np.zeros(len(counts))
+        np.maximum.at(largest, row, np.abs(J.data))
+        noise = np.where(largest <= TOLERANCES.gluing, TOLERANCES.gluing, TOLERANCES.no_grip)
+        J.data[np.abs(J.data) <= noise[row]] = 0.0
+        J.eliminate_zeros()
+        return BodyRows.of(J, self.bodies.count, self.bodies.k)
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
@@ -142,13 +161,13 @@ class CoarseSpace(Coarse):
         known.e = self.e
         return known
 
-    def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
+    def oblique(self, face: Face, C: Following) -> ObliqueProjectors:
         """Return the projectors on a face of the rows where others follow: λ = (I + C)u.
 
         Raise a FactorError where forces on the face do not determine what balances a load.
         """
         self.factors.count["face"] += int(self.dimension > 0)
-        return ObliqueProjectors(self.grams, face, C, self.factors.null, self.comm)
+        return ObliqueProjectors(self.grams, self.rows, face, C, self.factors.null)
 
     def unresisted(
         self, rows: Array, within: Motions | None = None, below: float = TOLERANCES.null
@@ -160,26 +179,15 @@ class CoarseSpace(Coarse):
         count differently. ``rows`` are flags of local rows, the space is by default ``unheld``,
         ``below`` as of ``rigid_bodies.unresisted``.
         """
-        grams = self.comm.gather(gram_of(self.J, rows, self.bodies.count, self.bodies.k), root=0)
+        space = within or self.unheld
+        if not space.free.any():
+            return space
+        grams = self.comm.gather(self.J.gram(rows), root=0)
         found: Any = None
         with raised_on_all_ranks(self.comm):
             if grams is not None:
-                found = unresisted(grams, within or self.unheld, below)
+                found = unresisted(grams, space, below)
         return cast(Motions, bcast_from_root(self.comm, found))
-
-
-def _without_rounding(J: csr_array) -> csr_array:
-    """Return the same rows, changed in place, without entries that are only rounding.
-
-    Points far from the origin have more of it than motions, but all rows that do not only glue act
-    on translations with about their size.
-    """
-    largest: Array = np.zeros(J.shape[0])
-    np.maximum.at(largest, np.repeat(np.arange(len(largest)), np.diff(J.indptr)), np.abs(J.data))
-    noise = np.where(largest <= TOLERANCES.gluing, TOLERANCES.gluing, TOLERANCES.no_grip)
-    J.data[np.abs(J.data) <= np.repeat(noise, np.diff(J.indptr))] = 0.0
-    J.eliminate_zeros()
-    return J
 
 
 def _sizes(B: PETSc.Mat) -> Array:

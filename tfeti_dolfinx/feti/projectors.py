@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import coo_array, csr_array, eye_array
+from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
-from tfeti_dolfinx.common.arrays import TINY, Array, Entries, LocalMatrix, transposed
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, LocalMatrix, rows_of, transposed
 from tfeti_dolfinx.common.parallel import any_rank, joined_over, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
+from tfeti_dolfinx.qp.friction_newton import Following
 from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
@@ -33,11 +33,11 @@ class Grams:
     """
 
     def __init__(self, Gt: csr_array, bounded: Array, comm: MPI.Intracomm) -> None:
-        self._comm, self.Gt, size = comm, Gt, Gt.shape[1]
+        self.comm, self.Gt, size = comm, Gt, Gt.shape[1]
         self._always = np.ones(Gt.shape[0], dtype=bool)
         self._always[bounded] = False
-        always = Gt[self._always]
-        base = replicated(transposed(always).csr() @ always, comm)
+        always = rows_of(Gt, np.flatnonzero(self._always))
+        base = replicated(transposed(always).csr() @ always.csr(), comm)
         # 1. the entries that contact rows reach, on all ranks, and those of the whole
         parts = list(_blocks(Gt, bounded))
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
@@ -55,11 +55,6 @@ class Grams:
         everything = np.ones(Gt.shape[0], dtype=bool)
         self.whole = self.of_face(Face(everything, np.full(len(everything), Status.FREE)))
 
-    @cached_property
-    def G(self) -> csr_array:
-        """This rank's columns of G, shape ``(r, m_local)``."""
-        return transposed(self.Gt).csr()
-
     def of_face(self, face: Face, damping: float = 0.0) -> csr_array:
         """GZ(GZ)ᵀ + damping·GGᵀ, shape ``(r, r)``.
 
@@ -73,10 +68,10 @@ class Grams:
             G_f = G[face.free[rows]]
             sums[places] += (G_f.T @ G_f).ravel()
         sums[-2:] = np.any(face.status[self._always] != Status.FREE), len(face.tangents)
-        *_, others, tangents = summed(self._comm, sums)
+        *_, others, tangents = summed(self.comm, sums)
         if others:
             along = face.Z.T @ self.Gt
-            gram = replicated(along.T.tocsr() @ along, self._comm)
+            gram = replicated(along.T.tocsr() @ along, self.comm)
             return gram + damping * self.whole if damping else gram
         data = np.array(self._base)
         data[self._reached] += sums[:-2]
@@ -85,25 +80,26 @@ class Grams:
         gram = csr_array((data, *self._table), shape=(size, size))
         if tangents:
             along = face.T.T @ self.Gt
-            gram = gram + replicated(along.T.tocsr() @ along, self._comm)
+            gram = gram + replicated(along.T.tocsr() @ along, self.comm)
         return gram
 
 
 def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
     """Rows with the same coordinates, their entries, dense, and numbers of pairs of coordinates."""
-    own = Gt[some]
-    own.eliminate_zeros()
-    own.sort_indices()
-    counts = np.diff(own.indptr)
+    own = rows_of(Gt, some)
+    stored = own.data != 0.0
+    row = np.repeat(np.arange(len(some)), np.diff(own.indptr))[stored]
+    indices, data = own.indices[stored].astype(np.int64), own.data[stored]
+    counts = np.bincount(row, minlength=len(some))
+    begins = np.cumsum(counts) - counts
     for count in np.unique(counts[counts > 0]):
         at = np.flatnonzero(counts == count)
-        places = own.indptr[at][:, None] + np.arange(count)
-        found, which = np.unique(own.indices[places], axis=0, return_inverse=True)
+        places = begins[at][:, None] + np.arange(count)
+        found, which = np.unique(indices[places], axis=0, return_inverse=True)
         for k, columns in enumerate(found):
             rows = np.flatnonzero(which.ravel() == k)
-            columns = columns.astype(np.int64)
             pairs = (columns[:, None] * Gt.shape[1] + columns).ravel()
-            yield some[at[rows]], own.data[places[rows]], pairs
+            yield some[at[rows]], data[places[rows]], pairs
 
 
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
@@ -231,19 +227,21 @@ class ObliqueProjectors:
     """
 
     def __init__(
-        self, grams: Grams, face: Face, C: csr_array, null: NullModes, comm: MPI.Intracomm
+        self, grams: Grams, rows: LocalMatrix, face: Face, C: Following, null: NullModes
     ) -> None:
-        self._comm, self._face, self._null, self._C = comm, face, null, C
-        self._G, self._Gt = grams.G, grams.Gt
-        led = csr_array((C.data * face.free[C.indices], C.indices, C.indptr), C.shape) @ grams.Gt
-        A, N = grams.of_face(face), replicated(grams.G @ led, comm)
+        self._comm, self._face, self._null, self._C = grams.comm, face, null, C
+        self._rows, led = rows, C.ratios * face.free[C.leaders]
+        followed = rows_of(grams.Gt, C.leaders, led).csr()
+        of_C = transposed(rows_of(grams.Gt, C.rows)).csr() @ followed
+        A, N = grams.of_face(face), replicated(of_C, self._comm)
         self._scale, pinned = _scaling(A, null)
         self._factor = None
-        with raised_on_all_ranks(comm):
+        with raised_on_all_ranks(self._comm):
             try:
                 if A.shape[1]:
                     H = _scaled(A + N, self._scale, pinned)
-                    self._factor = splu(H.csr().tocsc())
+                    # arrays of rows are those of the transpose's columns
+                    self._factor = splu(csc_array(H[:3], shape=H.shape))
             except RuntimeError as error:
                 raise FactorError(f"active set with friction: coarse problem: {error}") from error
 
@@ -251,21 +249,21 @@ class ObliqueProjectors:
         """H⁺y without null modes, for y orthogonal to them; shape ``(r,)`` or ``(r, q)``."""
         if self._factor is None:
             return y
-        x = self._factor.solve((self._scale * self._null.removed(y).T).T)
+        x = self._factor.solve((self._scale * self._null.removed(y).T).T, "T")
         return self._null.removed((self._scale * x.T).T)
 
     def coordinates(self, x: Array) -> Array:
         """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
         own = self._face.restricted(x)
-        return self._solve(summed(self._comm, self._G @ (own + self._C @ own)))
+        return self._solve(summed(self._comm, self._rows.transposed(own + self._C @ own)))
 
     def project(self, x: Array) -> Array:
         """P x, shapes ``(m_local,)`` or ``(m_local, q)``. Collective."""
-        return self._face.restricted(x - self._Gt @ self.coordinates(x))
+        return self._face.restricted(x - self._rows @ self.coordinates(x))
 
     def restoring(self, y: Array) -> Array:
         """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
-        return self._face.restricted(self._Gt @ self._solve(y))
+        return self._face.restricted(self._rows @ self._solve(y))
 
 
 # --- Factors of faces -----------------------------------------------------------------------

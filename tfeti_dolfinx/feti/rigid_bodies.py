@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
 from scipy.sparse import csc_array, csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import Array, Entries, entries_at, entries_of_rows, entries_within
+from tfeti_dolfinx.common.arrays import (
+    Array,
+    Entries,
+    beside,
+    entries_at,
+    entries_within,
+    sum_rows,
+)
 from tfeti_dolfinx.common.parallel import bcast_from_root, rows_over
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -46,7 +54,7 @@ class MotionTolerances:
 
 
 TOLERANCES = MotionTolerances()
-# bodies that meet, numbered as in ``gram_of``, and k × k blocks
+# bodies that meet, numbered as in ``BodyRows.gram``, and k × k blocks
 Pairs = tuple[Array, Array]
 
 # --- Dense algebra on parts of sparse matrices with few columns -------------------------------
@@ -101,6 +109,77 @@ def independent(columns: Array) -> Array:
     return np.asarray(qr(columns.T, pivoting=True, mode="r")[1][: columns.shape[1]])
 
 
+# --- Rows on motions of bodies ----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BodyRows:
+    """Rows of a matrix on k motions of n bodies each; a row has parts on the bodies it meets."""
+
+    row: Array  # of each part, ascending, shape (p,)
+    body: Array  # of each part, shape (p,)
+    parts: Array  # shape (p, k)
+    shape: tuple[int, int, int]  # number of rows, n, k
+
+    @classmethod
+    def of(cls, A: Any, n: int, k: int) -> BodyRows:
+        """Return the rows of a CSR matrix, shape ``(m, n k)``."""
+        row = np.repeat(np.arange(A.shape[0]), np.diff(A.indptr))
+        body, motion = np.divmod(A.indices.astype(np.int64), k)
+        met, which = np.unique(row * n + body, return_inverse=True)
+        parts = np.zeros((len(met), k))
+        parts[which, motion] = A.data
+        return cls(*np.divmod(met, max(n, 1)), parts, (A.shape[0], n, k))
+
+    def turned(self, U: Array) -> BodyRows:
+        """Return the product with square blocks of the bodies, shape ``(n, k, k)``."""
+        return replace(self, parts=np.einsum("pi,pij->pj", self.parts, U[self.body]))
+
+    def __matmul__(self, y: Array) -> Array:
+        """Return the product with a motion of the bodies, shape ``(n k,)``."""
+        _, n, k = self.shape
+        parts = np.einsum("pi,pi->p", self.parts, y.reshape(n, k)[self.body])
+        return np.bincount(self.row, parts, minlength=self.shape[0]).astype(float)
+
+    def transposed(self, x: Array) -> Array:
+        """Return the product of the transpose with a vector of the rows, shape ``(n k,)``."""
+        return sum_rows(self.body, self.parts * x[self.row, None], self.shape[1]).ravel()
+
+    def entries(self, shown: Array, numbers: Array, width: int) -> Entries:
+        """Return flagged entries of the parts, not 0, in columns with these numbers.
+
+        Flags have shape ``(p, k)``, numbers ``(n, k)``, ascending.
+        """
+        shown = shown & (self.parts != 0.0)
+        count = np.zeros(self.shape[0], dtype=np.int64)
+        np.add.at(count, self.row, shown.sum(axis=1))
+        table = np.concatenate(([0], np.cumsum(count)))
+        return Entries(self.parts[shown], numbers[self.body][shown], table, (len(count), width))
+
+    def csr(self) -> csr_array:
+        """Return the matrix, scipy CSR, shape ``(m, n k)``."""
+        _, n, k = self.shape
+        every = np.ones(self.parts.shape, dtype=bool)
+        return self.entries(every, np.arange(n * k).reshape(n, k), n * k).csr()
+
+    def gram(self, some: Array) -> Pairs:
+        """Return AᵀA of flagged rows: pairs i n + j of bodies that meet, and their blocks."""
+        _, n, k = self.shape
+        kept = some[self.row]
+        row, body, parts = self.row[kept], self.body[kept], self.parts[kept]
+        # all bodies of a row with each of them
+        first, last = np.searchsorted(row, row), np.searchsorted(row, row, side="right")
+        count = last - first
+        left = np.repeat(np.arange(len(row)), count)
+        right = np.arange(len(left)) - np.repeat(np.cumsum(count) - last, count)
+        pairs, which = np.unique(body[left] * n + body[right], return_inverse=True)
+        blocks = np.zeros((len(pairs), k, k))
+        for a, b in np.ndindex(k, k):
+            products = parts[left, a] * parts[right, b]
+            blocks[:, a, b] = np.bincount(which, products, minlength=len(pairs))
+        return pairs, blocks
+
+
 # --- Motions of bodies ------------------------------------------------------------------------
 
 
@@ -126,6 +205,13 @@ class Motions:
     def count(self) -> int:
         """Number of motions."""
         return int(self.free.sum()) + self.joint.shape[1]
+
+    @property
+    def columns(self) -> csr_array:
+        """All of them as columns, those of single bodies first."""
+        if not self.free.any():
+            return self.joint
+        return csr_array(hstack([self.alone, self.joint], format="csr"))
 
 
 def block_diagonal(blocks: Array) -> Entries:
@@ -154,7 +240,7 @@ def unresisted(grams: Sequence[Pairs], within: Motions, below: float = TOLERANCE
        connected components of bodies.
 
     Args:
-        grams: JᵀJ of the rows, as ``gram_of`` has it, to be added up.
+        grams: JᵀJ of the rows, as ``BodyRows.gram`` has it, to be added up.
         within: The space to look in; its joint motions are not looked at.
         below: Motions of a single body held by less than this share of its stiffest motion are
             taken in too; those of several bodies must be free (and may have parts in those).
@@ -199,28 +285,6 @@ def unresisted(grams: Sequence[Pairs], within: Motions, below: float = TOLERANCE
     )
 
 
-def gram_of(J: csr_array, some: Array, n: int, k: int) -> Pairs:
-    """JᵀJ of flagged rows on k motions of n bodies each: pairs i n + j that meet, their blocks."""
-    row = np.repeat(np.arange(J.shape[0]), np.diff(J.indptr))
-    kept = some[row]
-    body, motion = np.divmod(J.indices[kept].astype(np.int64), k)
-    met, which = np.unique(row[kept] * n + body, return_inverse=True)
-    parts = np.zeros((len(met), k))
-    parts[which, motion] = J.data[kept]
-    # all bodies of a row with each of them
-    row, body = np.divmod(met, max(n, 1))
-    first, last = np.searchsorted(row, row), np.searchsorted(row, row, side="right")
-    count = last - first
-    left = np.repeat(np.arange(len(met)), count)
-    right = np.arange(len(left)) - np.repeat(np.cumsum(count) - last, count)
-    pairs, which = np.unique(body[left] * n + body[right], return_inverse=True)
-    blocks = np.zeros((len(pairs), k, k))
-    for a, b in np.ndindex(k, k):
-        products = parts[left, a] * parts[right, b]
-        blocks[:, a, b] = np.bincount(which, products, minlength=len(pairs))
-    return pairs, blocks
-
-
 def _null_space(blocks: Array, i: Array, j: Array, held: Array) -> Iterator[tuple[Array, Array]]:
     """Null space of a Gram matrix with unit diagonal blocks, by components of bodies.
 
@@ -260,7 +324,7 @@ class Bodies:
         k: Candidate modes of each.
         frames: Modes' coefficients of each coordinate, shape ``(bodies, k, k)``.
         nodes: Number of nodes of each body, copies counted once, shape ``(bodies,)``.
-        motions: Kernel coordinates of the motions, scipy CSR, shape ``(r, bodies * k)``.
+        motions: Kernel coordinates of the motions; each coordinate is of one body.
         unsprung: Motions that springs do not resist.
         loads: ‖f‖ of each body, shape ``(bodies,)``.
         negligible: Work of each body's load, on a motion of mean square 1, that counts as none,
@@ -280,8 +344,8 @@ class Bodies:
         self.frames = W = bcast_from_root(comm, np.asarray(W))
         shares = np.swapaxes(W, 1, 2) @ subdomains.modes_outside() @ W
         self.unsprung = bcast_from_root(comm, unsprung(shares))
-        inside = rows_over(comm, subdomains.modes_in_kernel).csr()
-        self.motions = inside @ block_diagonal(self.frames).csr()
+        inside = rows_over(comm, subdomains.modes_in_kernel)
+        self.motions = BodyRows.of(inside, self.count, self.k).turned(self.frames)
         self.update_load()
 
     def update_load(self) -> None:
@@ -316,40 +380,35 @@ class KernelBasis:
     conditions.
     """
 
-    # directions of each body as columns, so that M = bodies.motions @ combined, shape (bodies * k,
-    # a)
-    combined: csr_array
-    motions: csr_array  # M, orthonormal, shape (r, a)
-    pins: Array  # coordinates that M takes the place of
-    rest: Array  # the others
-    inverse: csr_array  # inverse of M's rows at the pins
-    unheld: Array  # flags of the motions that no equality row resists, shape (a,)
-    free: Array  # flags of the motions that no row resists, shape (a,)
+    # directions of each body as columns, shape (bodies, k, k)
+    directions: Array
+    kept: Array  # flags of those in M, shape (bodies, k)
+    unheld: Array  # flags of those that no equality row resists
+    free: Array  # flags of those that no row resists
+    motions: BodyRows  # kernel coordinates of all directions, orthonormal those of M
+    coordinates: BodyRows  # T⁻¹ of the bodies' motions
+    rest: Array  # coordinates that M does not take the place of
 
     def kernel(self, y: Array) -> Array:
         """T y."""
-        x = self.motions @ y[: len(self.pins)]
-        x[self.rest] += y[len(self.pins) :]
-        return np.asarray(x)
+        along = np.zeros(self.kept.shape)
+        along[self.kept] = y[: len(y) - len(self.rest)]
+        x = self.motions @ along
+        x[self.rest] += y[len(y) - len(self.rest) :]
+        return x
 
-    def coordinates(self, X: csr_array) -> csr_array:
-        """T⁻¹X."""
-        first = self.inverse @ X[self.pins]
-        left = X - self.motions @ first
-        entries, table = entries_of_rows(left, self.rest)
-        data = np.concatenate((first.data, left.data[entries]))
-        columns = np.concatenate((first.indices, left.indices[entries]))
-        table = np.concatenate((first.indptr, first.indptr[-1] + table[1:]))
-        return Entries(data, columns, table, X.shape).csr()
+    def transposed(self, x: Array) -> Array:
+        """Tᵀx."""
+        return np.concatenate((self.motions.transposed(x)[self.kept.ravel()], x[self.rest]))
 
-    def rows(self, Gt: csr_array, J: csr_array, equalities: Array) -> csr_array:
+    def rows(self, Gt: csr_array, J: BodyRows, equalities: Array) -> csr_array:
         """Gᵀ T from Gᵀ and its rows J on motions of bodies, what is known to be zero left out."""
-        GtM = J @ self.combined
-        of_equalities = np.repeat(equalities, np.diff(GtM.indptr))
-        zero = np.where(of_equalities, self.unheld[GtM.indices], self.free[GtM.indices])
-        GtM.data[zero] = 0.0
-        GtM.eliminate_zeros()
-        return hstack([GtM, entries_within(Gt, slice(None), self.rest).csr()], format="csr")
+        along, body = J.turned(self.directions), J.body
+        zero = np.where(equalities[J.row, None], self.unheld[body], self.free[body])
+        numbers, width = np.cumsum(self.kept) - 1, int(self.kept.sum())
+        numbers = numbers.reshape(self.kept.shape)
+        GtM = along.entries(self.kept[body] & ~zero, numbers, width)
+        return beside(GtM, entries_within(Gt, slice(None), self.rest)).csr()
 
 
 def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
@@ -363,37 +422,34 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     of_unsprung, of_unheld, of_free = (F @ np.swapaxes(F, 1, 2) for F in bases)
     # eigenvalues: free −2, held by contact −1, by equality rows 0, by springs 3
     values, V = np.linalg.eigh(3.0 * (np.eye(bodies.k) - of_unsprung) - of_unheld - of_free)
-    kept = values < 1.5
-    every, size = np.ones(bodies.motions.shape[0], dtype=bool), np.zeros(V.shape)
-    pairs, blocks = gram_of(bodies.motions, every, bodies.count, bodies.k)
-    size[pairs // max(bodies.count, 1)] = blocks  # a coordinate is of one body
+    kept, X = values < 1.5, bodies.motions
+    size = sum_rows(X.body, X.parts[:, :, None] * X.parts[:, None, :], bodies.count)
     gram = np.swapaxes(V, 1, 2) @ size @ V
     gram = np.where(kept[:, :, None] & kept[:, None, :], gram, np.eye(bodies.k))
     directions = V @ np.linalg.inv(np.swapaxes(np.linalg.cholesky(gram), 1, 2))
-    combined = entries_within(block_diagonal(directions), slice(None), np.flatnonzero(kept)).csr()
-    motions = bodies.motions @ combined
-    body = np.repeat(np.arange(bodies.count), kept.sum(axis=1))
-    pins, inverse = _pins(motions.tocsc(), body)
-    rest = np.setdiff1d(np.arange(motions.shape[0]), pins)
-    unheld_of, free_of = values[kept] < -0.5, values[kept] < -1.5
-    return KernelBasis(combined, motions, pins, rest, inverse, unheld_of, free_of)
-
-
-def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
-    """Coordinates on which the motions of each body are independent, and the inverse there."""
-    if len(body) == 0:
-        return np.empty(0, dtype=np.int64), csr_array((0, 0))
-    pins, inverses = [], []
-    for own in np.split(np.arange(len(body)), np.flatnonzero(np.diff(body)) + 1):
-        entries = slice(motions.indptr[own[0]], motions.indptr[own[-1] + 1])
-        rows, row = np.unique(motions.indices[entries], return_inverse=True)
-        dense = np.zeros((len(rows), len(own)))
-        dense[row, np.repeat(own - own[0], np.diff(motions.indptr)[own])] = motions.data[entries]
-        chosen = independent(dense)
-        pins.append(rows[chosen])
-        inverses.append((own, np.linalg.inv(dense[chosen])))
-    inverse = on_rows(inverses, len(body))
-    return np.concatenate(pins), inverse
+    motions = X.turned(directions)
+    # coordinates on which the motions of each body are independent, and T⁻¹ of all of them
+    pins: list[Array] = [np.empty(0, dtype=np.int64)]
+    first: list[Array] = [np.empty((0, bodies.k))]
+    left = X.parts.copy()
+    order = np.argsort(X.body, kind="stable")
+    for own in np.split(order, np.flatnonzero(np.diff(X.body[order])) + 1) if len(order) else ():
+        M = motions.parts[own][:, kept[X.body[own[0]]]]
+        chosen = independent(M)
+        pins.append(own[chosen])
+        first.append(np.linalg.solve(M[chosen], X.parts[own[chosen]]))
+        left[own] -= M @ first[-1]
+    pinned = np.concatenate(pins)
+    others = np.setdiff1d(np.arange(len(left)), pinned)
+    rest = np.setdiff1d(np.arange(X.shape[0]), X.row[pinned])
+    coordinates = BodyRows(
+        np.append(np.arange(len(pinned)), len(pinned) + np.searchsorted(rest, X.row[others])),
+        X.body[np.append(pinned, others)],
+        np.concatenate((*first, left[others])),
+        X.shape,
+    )
+    unheld_of, free_of = kept & (values < -0.5), kept & (values < -1.5)
+    return KernelBasis(directions, kept, unheld_of, free_of, motions, coordinates, rest)
 
 
 # --- Names of motions in messages -------------------------------------------------------------

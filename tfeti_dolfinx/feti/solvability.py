@@ -226,7 +226,7 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
     """
     bodies, Z, sets = coarse.bodies, coarse.unheld.alone, constraints.sets
     body = np.repeat(np.arange(bodies.count), coarse.unheld.free.sum(axis=1))
-    J, size = coarse.J @ Z, coarse.row_size
+    J, size = coarse.J.csr() @ Z, coarse.row_size
     pressed = constraints.pressed if cones else np.empty(0, dtype=np.int64)
     given = np.setdiff1d(np.arange(len(sets.tangents)), pressed)
     above = constraints.pressed_by[pressed]

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import norm_over, steering, summed
@@ -53,6 +52,21 @@ DEFAULT = FrictionParameters()
 
 
 @dataclass(frozen=True)
+class Following:
+    """C: rows that follow others, (Cλ)_i = c_i λ_j with one j of each; other rows are 0."""
+
+    rows: Array  # i, shape (q,)
+    leaders: Array  # j, shape (q,)
+    ratios: Array  # c_i, shape (q,)
+
+    def __matmul__(self, x: Array) -> Array:
+        """Return C x, shapes ``(m,)`` or ``(m, q)``."""
+        y = np.zeros(x.shape)
+        y[self.rows] = (self.ratios * x[self.leaders].T).T
+        return y
+
+
+@dataclass(frozen=True)
 class Law:
     """λ ∈ Ω(λ_N), on this rank's rows: the set of a point's λ_T is λ_N times one of its own."""
 
@@ -60,18 +74,15 @@ class Law:
     normals: Array  # row of λ_N of each point, shape (p,)
     tangents: Array  # rows of its λ_T, shape (p, k)
 
-    def following(self, p: Array, face: Face) -> csr_array:
-        """C: where points slip λ_T follows λ_N, λ_T = Cλ with the direction of p. Shape ``(m, m)``.
+    def following(self, p: Array, face: Face) -> Following:
+        """C: where points slip λ_T follows λ_N, λ_T = Cλ with the direction of p.
 
         p is a point of Ω(p_N), and ``face`` its face.
         """
         at = np.flatnonzero(np.any(face.status[self.tangents] == Status.SLIP, axis=1))
         rows = self.tangents[at].ravel()
-        columns = np.repeat(self.normals[at], self.tangents.shape[1])
-        order = np.argsort(rows)
-        table = np.searchsorted(rows[order], np.arange(len(p) + 1))
-        values = (p[rows] / p[columns])[order]
-        return csr_array((values, columns[order], table), shape=(len(p), len(p)))
+        leaders = np.repeat(self.normals[at], self.tangents.shape[1])
+        return Following(rows, leaders, p[rows] / p[leaders])
 
 
 @dataclass(frozen=True)
@@ -95,7 +106,7 @@ class LawProgram:
     law: Law  # the sets
     # makes the projectors of a face and of C, what follows it: P of λ = (I + C)u with
     # `coordinates`, `project` and `restoring` as in `ObliqueProjectors`
-    oblique: Callable[[Face, csr_array], Any]
+    oblique: Callable[[Face, Following], Any]
     norm: float  # ‖F‖, or an estimate
     # of all coefficients of friction: Ω(share λ_N) is the set; 0: contact without any
     share: float = 1.0
@@ -212,7 +223,7 @@ class OnFace:
     """The face of a Newton step, its point p, and C: what follows it."""
 
     face: Face
-    C: csr_array
+    C: Following
     p: Array
 
     def followed(self, u: Array) -> Array:
@@ -222,8 +233,9 @@ class OnFace:
     def entered(self, lam: Array) -> Array:
         """Return λ with open and slipping entries set to those of p, coupled ones following."""
         held = np.isin(self.face.status, (Status.OPEN, Status.SLIP))
-        follows = np.diff(self.C.indptr) > 0
-        return np.where(follows, self.C @ lam, np.where(held, self.p, lam))
+        on = np.where(held, self.p, lam)
+        on[self.C.rows] = self.C.ratios * lam[self.C.leaders]
+        return on
 
 
 def _solved_on_face(
