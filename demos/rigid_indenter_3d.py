@@ -123,7 +123,7 @@ way = np.array([-record.tools["indenter displacement z"] for record in loaded])
 
 # ## Comparison with the closed form
 #
-# F = 4/3 E* √R d^(3/2) at each depth; a and p₀ are those that belong to the force that was found.
+# F = 4/3 E* √(R d³) at each depth; a and p₀ are those that belong to the force that was found.
 
 # +
 load = force[-1]

@@ -1,7 +1,7 @@
 # # A half ball of rubber pressed flat
 #
 # A half ball of neo-Hooke is pressed on a rigid plane by 40 % of its radius: finite strain, and
-# contact where the ball is. At first the force is that of Hertz, F = 4/3 E* √R d^{3/2}; then the
+# contact where the ball is. At first the force is that of Hertz, F = 4/3 E* √(R d³); then the
 # contact is no longer small compared with the ball, and the ball is stiffer.
 #
 #     ./run mpirun -n 2 python3 demos/rubber_pressed_3d.py --plot

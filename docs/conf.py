@@ -8,8 +8,10 @@ With ``-t online`` types of other packages link to their pages, whose lists are 
 import re
 import sys
 from collections.abc import Iterator
+from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 from sphinx.util.inspect import TypeAliasForwardRef
@@ -45,6 +47,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_codeautolink",
+    "sphinx-mathjax-offline",  # formulas without a network: MathJax lies in the site
 ]
 myst_enable_extensions = ["amsmath", "attrs_inline", "dollarmath"]
 myst_heading_anchors = 3
@@ -64,12 +67,13 @@ if not tags.has("online"):  # type: ignore[name-defined]  # noqa: F821  # Sphinx
 TypeAliasForwardRef.__repr__ = lambda self: self.name  # type: ignore[method-assign]
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-autodoc_type_aliases = {name: name for name in ("Array", "ArrayLike", "Gap", "Subdomains")}
+autodoc_type_aliases = {name: name for name in ("Array", "ArrayLike", "Gap", "Point", "Subdomains")}
 autodoc_member_order = "bysource"
 toc_object_entries_show_parents = "hide"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False  # types of attributes stand in the signature
 
 html_theme = "pydata_sphinx_theme"
 html_title = project
@@ -184,6 +188,39 @@ def make_cards(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = "\n".join(lines) + f"\n```{{toctree}}\n:hidden:\n\n{table}\n```\n"
 
 
+def keep_numbers_whole(app: Sphinx, page: str, source: list[str]) -> None:
+    """Keep sums, shares and powers in tables on one line."""
+
+    def kept(row: re.Match[str]) -> str:
+        parts = row[0].split("`")
+        for i, text in enumerate(parts[::2]):
+            text = re.sub(r"(?<=\d) (?=[+%])|(?<=\+) (?=\d)", "\N{NO-BREAK SPACE}", text)
+            parts[2 * i] = re.sub(r"(?<=\de)-(?=\d)", "\N{NON-BREAKING HYPHEN}", text)
+        return "`".join(parts)
+
+    source[0] = re.sub(r"^\|.*$", kept, source[0], flags=re.MULTILINE)
+
+
+def shorten_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str | None, returns: Any
+) -> tuple[str, Any] | None:
+    """Show types of a dataclass as they are written, and nothing where no user makes one."""
+    if what != "class" or signature is None:
+        return None
+    if name.endswith((".Options", ".Report")) or signature in ("(*args, **kwargs)", "(*values)"):
+        return "", returns
+    if is_dataclass(obj) and re.search(r"~|<factory>|\b_", signature):
+        parts: list[str] = []
+        for field in fields(obj):
+            parts += ["*"] * (field.kw_only and "*" not in parts)
+            default = "" if field.default is MISSING else f" = {field.default!r}"
+            default = default if field.default_factory is MISSING else " = ..."
+            default = re.sub(r"<function (\w+) at \w+>", r"\1", default)
+            parts += [f"{field.name}: {field.type}{default}"] * (not field.name.startswith("_"))
+        return f"({', '.join(parts)})", returns
+    return None
+
+
 def write_root_page(app: Sphinx, error: Exception | None) -> None:
     """Write ``index.html``, which leads to the first page: that is in a folder of its own."""
     if error is None and app.builder.format == "html":
@@ -200,4 +237,6 @@ def setup(app: Sphinx) -> None:
     app.connect("builder-inited", write_api)
     app.connect("source-read", make_cards)
     app.connect("source-read", list_api)
+    app.connect("source-read", keep_numbers_whole)
+    app.connect("autodoc-process-signature", shorten_signature)
     app.connect("build-finished", write_root_page)

@@ -157,7 +157,7 @@ class Options:
 
     @property
     def number(self) -> float:
-        """rtol as a number: how accurate displacements have to be."""
+        """rtol as a number, how accurate displacements have to be."""
         return LOOSEST if isinstance(self.rtol, str) else self.rtol
 
     def view_text(self, prefix: str) -> str:

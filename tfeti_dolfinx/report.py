@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import resource
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from textwrap import TextWrapper
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from mpi4py import MPI
@@ -268,6 +269,30 @@ class Outcome:
 
 # --- The report -------------------------------------------------------------------------------
 
+
+class Seconds(dict[str, float]):
+    """Map stages to wall seconds, largest over ranks; old names of stages warn and give the new."""
+
+    RENAMED: ClassVar = {
+        "gluing": "constraints",
+        "subdomains": "factors",
+        "dual": "coarse",
+        "qp": "solve",
+    }
+
+    def __missing__(self, key: str) -> float:
+        new = self.RENAMED.get(key)
+        if new not in self:
+            raise KeyError(key)
+        text = f"report.seconds[{key!r}] is called {new!r}"
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return self[new]
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the seconds of a stage, by an old name, too; else the default."""
+        return self[key] if key in self or self.RENAMED.get(key) in self else default
+
+
 PRINTED = 10  # of a list; all of it is in the file
 WIDTH = 100  # of the printed lines
 SHOWN = ("displacement_error", "penetration", "balance")  # residuals of the short report
@@ -284,7 +309,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
     """
 
     newton_steps: int = 0  # of a nonlinear problem, each a linearised problem
-    seconds: dict[str, float] = field(default_factory=dict)  # of each stage, and ``total``
+    seconds: dict[str, float] = field(default_factory=Seconds)  # of each stage, and ``total``
     motion: dict[str, float] = field(default_factory=dict)  # of bodies with mass: energies, work
     contact_forces: list[list[float]] = field(default_factory=list)  # of bodies with mass: means
     in_all: dict[str, float] = field(default_factory=dict)  # solves, counters, seconds of all
@@ -301,7 +326,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         known = {name: value for record in records for name, value in vars(record).items()}
         total = sum(seconds.values())
         own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
-        return cls(**known, seconds={**seconds, "total": total}, in_all=added(before, own))
+        return cls(**known, seconds=Seconds(seconds, total=total), in_all=added(before, own))
 
     def take(self, other: Report) -> None:
         """Take all fields of another report: a program may hold this one over many solves."""

@@ -186,7 +186,7 @@ class Decomposition:
 
     @property
     def num_bodies(self) -> int:
-        """Number of bodies: parts of the untorn mesh connected through facets."""
+        """Number of bodies, parts of the untorn mesh connected through facets."""
         return int(self.body_of_subdomain.max()) + 1
 
     @property

@@ -25,9 +25,10 @@ class NewtonTolerances:
             and places anew.
         loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
             0.01.
-        steepest, flattest: In small strain forcing expects the next increment to be between these
-            shares of the last one: the slope along one step does not see all that is left, and at
-            that of a kept tangent a new one would be solved to more than it moves.
+        steepest: In small strain forcing expects the next increment to be at least this share of
+            the last one: the slope along one step does not see all that is left.
+        flattest: And at most this: at that of a kept tangent a new one would be solved to more
+            than it moves.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.

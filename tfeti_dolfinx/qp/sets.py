@@ -57,12 +57,12 @@ class Face:
 
     @cached_property
     def carrying(self) -> Array:
-        """Rows that carry a force: all but the open ones; flags, shape ``(m,)``."""
+        """Rows that carry a force, all but the open ones; flags, shape ``(m,)``."""
         return np.asarray(self.status != Status.OPEN)
 
     @cached_property
     def holding(self) -> Array:
-        """Rows that hold what they multiply, Bu = c: neither open nor slipping; flags."""
+        """Rows that hold what they multiply, Bu = c, neither open nor slipping; flags."""
         return self.carrying & (self.status != Status.SLIP)
 
     @cached_property

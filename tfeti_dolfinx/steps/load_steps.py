@@ -298,7 +298,7 @@ class LoadSteps:
         """Write a table of the steps so far, a line a step, by rank 0. Collective.
 
         Columns: time, the force on each contact by name and axis, motion and forces of each rigid
-        body, what friction dissipates, iterations, seconds.
+        body, what friction dissipates, iterations (``F`` in older files), seconds.
 
         Args:
             path: File, ending in ``.csv``; one that is there is replaced.
