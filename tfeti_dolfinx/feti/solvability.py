@@ -92,6 +92,8 @@ class RigidScene:
                 new = self._violated(cones, given, y / size, float(x[-1]) / size, count)
                 if new.shape[0] == 0:
                     return y, float(cost @ x)
+                if n == 1 and not given:  # what stops the only motion leaves none
+                    break
                 cuts, count = vstack([cuts, new], format="csr"), 2 * count
             return np.zeros(n), 0.0
 

@@ -94,22 +94,25 @@ def first_point(qp: QP) -> Array:
         # where 0 is inside of Ω, as with adhesion, rows of contact are free and may leave it
         if held and not any_rank(qp.coarse.comm, qp.feasible.project(lam) != lam):
             return lam
-    return _on_foundation(qp, project_onto_feasible(qp.coarse, qp.feasible, zero)[0])
+    return _on_foundation(qp)
 
 
-def _on_foundation(qp: QP, lightest: Array, max_it: int = 20, alike: float = 0.1) -> Array:
+def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1) -> Array:
     """Return forces of rigid bodies on springs that balance the load: which rows touch first.
 
     It is the feasible point nearest to the forces of springs that gaps press. How many rows carry
     depends on how soft springs are, and that on how many carry: found by at most ``max_it`` turns,
     until these numbers differ by no more than the share ``alike``. Where the least λ of Ω does not
-    balance the load, it is that. Collective.
+    balance the load, it is that. Each projection begins where the one before has ended, the first
+    at the least λ of all. Collective.
     """
+    zero, whole = np.zeros(len(qp.d)), qp.coarse.solve(qp.coarse.e)
+    lightest, alpha = project_onto_feasible(qp.coarse, qp.feasible, zero, whole)
     if qp.foundation is None or imbalance(qp.coarse, lightest) > UNBALANCED:
         return lightest
     count, lam = 1, lightest
     for _ in range(max_it):
-        lam = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count))[0]
+        lam, alpha = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count), alpha)
         touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
         before = count
         count = max(int(summed(qp.coarse.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)

@@ -50,6 +50,7 @@ def project_onto_feasible(
     coarse: Coarse,
     feasible: FeasibleSet | WithinFace,
     y: Array,
+    alpha: Array | None = None,
     parameters: ProjectionParameters = DEFAULT,
 ) -> tuple[Array, Array]:
     """Project y onto {λ ∈ Ω, Gλ = e}, or come as close to that set as possible. Collective.
@@ -58,7 +59,8 @@ def project_onto_feasible(
     ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
     line search finds: each step factors G_f G_fᵀ, f the face of λ(α). Where nothing in Ω fulfils
     Gλ = e, the cost falls without end along steps that no row stops; a few of them end it, and
-    ``imbalance`` of λ says so. Return this rank's part of λ, and α, which all ranks have.
+    ``imbalance`` of λ says so. ``alpha`` is where to begin; default 0. Return this rank's part of
+    λ, and α, which all ranks have.
 
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
@@ -68,7 +70,7 @@ def project_onto_feasible(
     [1.0, 0.0]
     """
     comm = coarse.comm
-    trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension))
+    trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
     damping, trials, unmet, slowly, least = parameters.damping, 1, 0, 0, trial.left
     while trials < parameters.max_trials and unmet < parameters.patience:
         terms = coarse.terms(trial.lam) + np.abs(coarse.e)
