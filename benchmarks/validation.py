@@ -385,11 +385,6 @@ def bar_on_wall(scale: float) -> Iterator[Row]:
         yield figure(case, quantity, published, got, 0.05, of_run, in_all(report))
 
 
-def ball_above(radius: float, depth: float, x: np.ndarray) -> np.ndarray:
-    """Height of a ball over the points of a plane, where it is so deep in it."""
-    return radius - depth - np.sqrt(np.maximum(radius**2 - x[0] ** 2, 0.0))
-
-
 def plastic_indentation(scale: float) -> Iterator[Row]:
     """A rigid sphere pressed into a perfectly plastic block, axisymmetric; force per radian."""
     figures = {  # by the depth: slip lines, Code_Aster, what it allows
@@ -402,11 +397,10 @@ def plastic_indentation(scale: float) -> Iterator[Row]:
     words = ["--size", scale * 20.0, "--near", 360.0]
     made = scene_of("plastic_indentation_2d", words, "NonlinearContactProblem")
     problem = tfeti.NonlinearContactProblem(**made)
-    total, case, radius = 0, "SSNV506, plastic indentation", 500.0
+    total, case = 0, "SSNV506, plastic indentation"
     step = 5.0 * scale
     for depth in np.arange(step, max(figures) + 0.5 * step, step):
-        gap = partial(ball_above, radius, depth)
-        problem.update(gap={"ball": gap})
+        problem.time = depth
         problem.solve()
         problem.accept()
         total += work(problem)

@@ -89,11 +89,15 @@ bcs = []
 for name, k in (("axis", 0), ("bottom", 0), ("bottom", 1)):
     held = fem.locate_dofs_topological(V.sub(k), 1, decomposition.facets(name))
     bcs.append(fem.dirichletbc(0.0, held, V.sub(k)))
+ball = tfeti.SignedDistance(
+    lambda x: R - np.sqrt(np.maximum(R**2 - x[0] ** 2, 0.0)) - x[1],
+    lambda x: np.stack([np.zeros_like(x[0]), -np.ones_like(x[0])]),
+)
 problem = tfeti.NonlinearContactProblem(
     steel.residual(v),
     u,
     bcs,
-    [tfeti.Obstacle("top", tfeti.Plane((0.0, 0.0), normal=(0.0, -1.0)), name="ball")],
+    [tfeti.Obstacle("top", ball, displacement=lambda depth: (0.0, -depth), name="ball")],
     decomposition,
     J=steel.tangent(du, v),
     state=steel.state,
@@ -104,13 +108,9 @@ problem = tfeti.NonlinearContactProblem(
 )
 
 
-def press(problem, depth):
-    problem.update(gap={"ball": lambda x: R - depth - np.sqrt(np.maximum(R**2 - x[0] ** 2, 0.0))})
-
-
 steps = arguments.steps or (2 if arguments.quick else 10)
 depths = (arguments.depth or (2.0 if arguments.quick else 20.0)) * np.arange(1, steps + 1) / steps
-records = tfeti.LoadSteps(problem, press, depths).run()
+records = tfeti.LoadSteps(problem, lambda problem, depth: None, depths).run()
 # -
 
 # ## Comparison with slip lines
@@ -136,7 +136,7 @@ if arguments.output:
     tfeti.write_vtx(arguments.output / "plastic_indentation_2d.bp", problem.solution)
 if arguments.plot:
     folder = arguments.output or Path("results")
-    look = {"zoom": 4.5, "focus": (300.0, -230.0, 0.0), "highest": strength}
+    look = {"zoom": 4.5, "focus": (300.0, -190.0, 0.0), "highest": strength}
     tfeti.plot_deformed(
         folder / "plastic_indentation_2d.png", problem.solution, unit="MPa", factor=1.0, **look
     )
