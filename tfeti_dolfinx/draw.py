@@ -8,6 +8,7 @@ must not start MPI.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -41,8 +42,8 @@ CORNER = 30.0  # degrees between facets that meet in an edge
 
 
 def start_screen() -> subprocess.Popen[bytes] | None:
-    """Xvfb, unless there is an X server already."""
-    if os.environ.get("DISPLAY"):
+    """Xvfb, unless there is an X server already, or no Xvfb: a newer VTK draws without one."""
+    if os.environ.get("DISPLAY") or shutil.which("Xvfb") is None:
         return None
     read, write = os.pipe()
     command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x1024x24"]

@@ -90,8 +90,8 @@ def plot_deformed(
         The file written.
 
     Raises:
-        InputError: There is no X server and no Xvfb to start one, the problem has no stress, or
-            an argument does not fit.
+        InputError: VTK needs a screen and there is no X server and no Xvfb to start one, the
+            problem has no stress, or an argument does not fit.
         TfetiError: The picture could not be drawn.
     """
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
@@ -119,7 +119,6 @@ def plot_deformed(
     parts = comm.gather(_grid(solution, {"values": _values(solution, show)}), root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}", OSError):
         if comm.rank == 0 and parts is not None:
-            check_screen()
             whole = _joined(parts)
             if highest is None and show == "von_mises" and len(whole["values"]):
                 scene["highest"] = max(float(np.quantile(whole["values"], 0.995)), 1e-300)
@@ -249,14 +248,6 @@ def plot_friction(
     return target
 
 
-def check_screen() -> None:
-    """Raise an InputError, with what to install, where pictures find no X server and no Xvfb."""
-    if not os.environ.get("DISPLAY") and shutil.which("Xvfb") is None:
-        raise InputError(
-            "pictures need an X server: set DISPLAY, or install Xvfb (Debian: apt-get install xvfb)"
-        )
-
-
 def _vector(values: Any, what: str) -> Array:
     """Three numbers, nan if they are not given."""
     if values is None:
@@ -370,6 +361,11 @@ def _draw(target: Path, data: dict[str, object]) -> None:
             command, capture_output=True, text=True, timeout=SECONDS, check=False
         )
         if result.returncode != 0 or not partial.exists():
+            if not os.environ.get("DISPLAY") and shutil.which("Xvfb") is None:
+                raise InputError(
+                    f"{target}: pictures by this VTK need an X server: set DISPLAY, or install "
+                    "Xvfb (Debian: apt-get install xvfb) or VTK 9.5"
+                )
             raise TfetiError(f"{target} could not be drawn:\n{result.stderr[-2000:]}")
 
 
