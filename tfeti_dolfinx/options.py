@@ -98,7 +98,10 @@ class Options:
         choices=LOCAL_TYPES,
     )
     local_multiplications: int = described(
-        50, "subdomains", "iterations to expect, for that count", fits=FROM_0
+        50,
+        "subdomains",
+        "iterations to expect, for that count; a fifth of it for a tangent of nonlinear bodies",
+        fits=FROM_0,
     )
     clusters: int = described(
         0,

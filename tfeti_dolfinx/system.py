@@ -43,6 +43,9 @@ from tfeti_dolfinx.subdomains.subdomains import (
     subdomain_data,
 )
 
+# a tangent of Newton's method serves this part of the multiplications of a stiffness that stays
+OF_TANGENT = 5
+
 # --- Settings of a solve ---------------------------------------------------------------------
 
 
@@ -83,16 +86,19 @@ class Settings:
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
         tools: Tools | None = None,
         equals: EqualSubdomains | None = None,
+        tangents: bool = False,
     ) -> Subdomains:
         """Return all Blocks of a rank as one. Collective.
 
         ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; ``tools``
         are rigid bodies, of which those with free motions get Blocks. Stiffnesses that ``equals``
-        knows are shared, unless the type of local operators is another. Raise an InputError where
-        stiffness or load do not fit; a FactorError where a factor could not be made.
+        knows are shared, unless the type of local operators is another; ``tangents`` do not stay.
+        Raise an InputError where stiffness or load do not fit; a FactorError where a factor could
+        not be made.
         """
         own, options, decomposition = self.extensions, self.options, dofs.decomposition
-        choice = LocalChoice(options.local_type, options.local_multiplications)
+        expected = options.local_multiplications // (OF_TANGENT if tangents else 1)
+        choice = LocalChoice(options.local_type, expected)
         how = self.inverses(counters)
         found = (equals or EqualSubdomains(how)) if choice.type in ("auto", "shared") else None
         make = own.block or (lambda item: SparseBlock(item, how, found))
@@ -452,6 +458,7 @@ class System:
             self.elements.blocks,
             self.tools if self.tools.num_unknowns else None,
             self._equals,
+            self.follows,
         )
         self._K, self._subdomains.tangents = None, self.follows
         self._subdomains.retrace(trace)

@@ -55,6 +55,8 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     comm, bodies = graph.comm, graph.pieces(np.zeros(graph.num_cells, dtype=np.int64))
     body, sizes = bodies.of_cell, bodies.size
     shares = _shares(sizes, num_parts)
+    if np.all(shares == 1):
+        return body
     extents = mesh.extents()
     flat = np.any(BISECTION.flat * extents <= extents.max(axis=1, initial=0.0)[:, None], axis=1)
     boxes = 2 * _counts(comm, body[flat], len(sizes)) > sizes
