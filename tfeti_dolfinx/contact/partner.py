@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from numbers import Real
@@ -44,7 +45,7 @@ GEOMETRY, CURVED = "geometry", "curved"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ContactPartner:
+class ContactPartner(ABC):
     """An obstacle, or a pair of surfaces. All methods are collective."""
 
     gap: Gap = GEOMETRY  # the gaps of its conditions: those of the geometry, or given ones
@@ -62,10 +63,11 @@ class ContactPartner:
             checked_type(self.friction, FrictionLaw, f"{self.name}: friction", expected)
 
     @property
+    @abstractmethod
     def surfaces(self) -> tuple[str | int, ...]:
         """Names or tags of the surfaces, that with the multipliers first."""
-        raise NotImplementedError
 
+    @abstractmethod
     def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
         """Return the conditions; raise an InputError where a surface, shape, gap or law is unfit.
 
@@ -73,7 +75,6 @@ class ContactPartner:
         apart are not made. The depth is the largest initial overlap of two surfaces, and how far a
         given gap replaces it; a body may lie in an obstacle as deep as it likes.
         """
-        raise NotImplementedError
 
     def first_reach(self, decomposition: Decomposition) -> float:
         """Return the first reach; raise an InputError where it, surfaces or gap do not fit."""

@@ -93,10 +93,7 @@ class ContactSearch:
         for i, gap in gaps.items():
             contacts[i] = contacts[i].with_gap(gap)
             values = contacts[i].gaps(self._dofs, records[i], self._depths[i])
-            if self._tools:  # at their places
-                there = self._tools.motion_there(records[i])
-                values = values - np.sum(records[i].normal * there, axis=1)
-            records[i] = replace(records[i], gap=values)
+            records[i] = self._from_origin(replace(records[i], gap=values))
         self.contacts, self._records = contacts, records
 
     def rows(self) -> tuple[list[float], list[Array]]:
