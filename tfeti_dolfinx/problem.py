@@ -23,8 +23,8 @@ from tfeti_dolfinx.common.validation import checked_number, checked_type
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import (
     Gluing,
+    check_conditions,
     check_not_on_tears,
-    checked_conditions,
     listed_conditions,
 )
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts, gaps_by_position
@@ -123,13 +123,13 @@ class ContactProblem:
             own = guarded(extensions, self.options, comm)
             self._settings = Settings(self.options, petsc_options_prefix, for_factors, own)
             self.contacts = checked_contacts(contacts)
-            bcs = listed_conditions(bcs)
-            given |= {"a": a, "L": L, "bcs": bcs, "contacts": contacts, "thickness": thickness}
+            self.bcs = listed_conditions(bcs)
+            given |= {"a": a, "L": L, "bcs": self.bcs, "contacts": contacts, "thickness": thickness}
             given |= {"stress": stress, "u": u, "boundary_elements": boundary_elements}
             given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
             given |= self._given_besides()
         V = displacement_space(a, decomposition, self.form_name)
-        self.bcs = checked_conditions(bcs, V)
+        check_conditions(self.bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
         self._given_stress = stress
         self._stress: Freezable | None = None
@@ -397,7 +397,7 @@ class ContactProblem:
         if conditions is None:
             conditions = self.bcs
         else:
-            conditions = checked_conditions(conditions, V)
+            check_conditions(conditions, V)
             check_not_on_tears(conditions, self.dofs)
         if stiffness is not None:
             check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")

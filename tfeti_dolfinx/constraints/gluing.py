@@ -141,15 +141,11 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
 
 
-def checked_conditions(
-    bcs: Iterable[fem.DirichletBC], V: fem.FunctionSpace
-) -> list[fem.DirichletBC]:
-    """Return the conditions as a list. Collective.
+def check_conditions(conditions: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> None:
+    """Raise unless Dirichlet conditions are on V or a component of V, with unknowns of it.
 
-    Raise an InputError where they are no Dirichlet conditions on V or a component of V, or one of
-    them has no unknowns, or some that V has not.
+    Collective.
     """
-    conditions = listed_conditions(bcs)
     count = np.zeros(len(conditions), dtype=np.int64)
     with raised_on_all_ranks(V.mesh.comm):
         for number, bc in enumerate(conditions):
@@ -161,7 +157,6 @@ def checked_conditions(
             f"Dirichlet condition {int(np.argmin(total))} holds nowhere: it has no unknowns on any "
             "rank; expected at least one"
         )
-    return conditions
 
 
 def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
