@@ -14,11 +14,9 @@ from test_qp import matrix, vector
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.friction_newton import (
-    FrictionParameters,
     Law,
     LawPoint,
     LawProgram,
-    follow_friction,
     newton_on_law,
 )
 from tfeti_dolfinx.qp.problem import QP
@@ -95,21 +93,6 @@ def test_it_solves_the_law(seed, k, r):
         assert replace(whole, norm=norm).natural_map(LawPoint(end.lam, s, end.mu))[2] <= 1e-8
     near = law.at(np.maximum(end.lam[law.normals], 0.0)).project(end.lam)
     assert np.allclose(near, end.lam, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("most", [4, 7])
-def test_a_path_from_no_friction_leads_to_the_law(seed, most):
-    """By shares of the coefficients where few steps have to do for each; it gives up with fewer."""
-    F, d, G, e, law = program(seed, 2, 3)
-    whole, end, direct = solve(F, d, G, e, law)
-    zero = LawPoint(np.zeros(len(d)), -d, np.zeros(len(e)))
-    short = FrictionParameters(path_steps=most)
-    found, steps = follow_friction(whole, zero, 1e-10, 1e-6, short)
-    assert (found is None) == (most == 4)
-    if most == 7:
-        assert steps > direct
-        assert np.allclose(found.lam, end.lam, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,12 +38,6 @@ class FrictionParameters:
     new: float = 1e-7  # of Az: what earlier directions leave of it, less is rounding
     gain: float = 1e-8  # of the residual: what a direction takes from it, less is no gain
     rounding: float = 1e-16  # of a residual: no λ that has it comes lower
-    # what solves on the path of growing friction leave of their residual: beside soft motions
-    # `reduction` leaves all others
-    path_reduction: float = 1e-3
-    path_steps: int = 25  # most steps for one share of the coefficients
-    path_length: int = 200  # most steps on the whole path
-    path_shortest: float = 1e-4  # its shortest step
 
 
 DEFAULT = FrictionParameters()
@@ -108,8 +102,6 @@ class LawProgram:
     # `coordinates`, `project` and `restoring` as in `ObliqueProjectors`
     oblique: Callable[[Face, Following], Any]
     norm: float  # ‖F‖, or an estimate
-    # of all coefficients of friction: Ω(share λ_N) is the set; 0: contact without any
-    share: float = 1.0
 
     def natural_map(self, at: LawPoint) -> tuple[FeasibleSet, Array, float]:
         """Return Ω(y_N⁺), p = P(y), and ‖F‖ times what λ misses of the law and of Gλ = e.
@@ -117,7 +109,7 @@ class LawProgram:
         That is ‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks.
         """
         coarse, y = self.qp.coarse, at.lam - at.s / self.norm
-        feasible = self.law.at(self.share * np.maximum(y[self.law.normals], 0.0))
+        feasible = self.law.at(np.maximum(y[self.law.normals], 0.0))
         p = feasible.project(y)
         balancing = coarse.combined(coarse.solve(coarse.residual(at.lam)))
         missed = norm_over(coarse.comm, np.concatenate((p - at.lam, balancing)))
@@ -172,47 +164,6 @@ def newton_on_law(
             there = LawPoint(*((1.0 - part) * a + part * b for a, b in ends))
         at = there
     return None, parameters.max_steps
-
-
-def follow_friction(
-    program: LawProgram,
-    at: LawPoint,
-    target: float,
-    loose: float,
-    parameters: FrictionParameters = DEFAULT,
-) -> tuple[LawPoint | None, int]:
-    """Solve the law along the path of its solutions for growing shares of its coefficients.
-
-    Without friction the solution is unique, and where bodies are held the path that begins there is
-    bounded, so that it leads on to the whole coefficients (Allgower, Georg, Introduction to
-    Numerical Continuation Methods, 2003, chapter 11). The share grows by twice the last step, by a
-    quarter of it where Newton's method fails; it gives up where the path turns back. Collective.
-    ``target`` is as of ``newton_on_law``, at the end, ``loose`` the same on the way. Return where
-    it has ended, None if it gave up; and the steps taken.
-    """
-    exact = replace(parameters, reduction=parameters.path_reduction)
-    short = replace(exact, max_steps=parameters.path_steps)
-    # Step 1: exacter solves alone may be enough
-    whole, steps = newton_on_law(program, at, target, short)
-    if whole is not None:
-        return whole, steps
-    # Step 2: without friction
-    point, taken = newton_on_law(replace(program, share=0.0), at, loose, exact)
-    steps += taken
-    # Step 3: all of it at once, or less
-    share, length = 0.0, 1.0
-    while point is not None and share < 1.0 and length >= parameters.path_shortest:
-        if steps >= parameters.path_length:
-            break
-        new = min(share + length, 1.0)
-        goal = target if new == 1.0 else loose
-        end, taken = newton_on_law(replace(program, share=new), point, goal, short)
-        steps += taken
-        if end is None:
-            length *= 0.25
-        else:
-            point, share, length = end, new, 2.0 * length
-    return (point if share == 1.0 else None), steps
 
 
 # --- The system of a step ---------------------------------------------------------------------

@@ -19,7 +19,6 @@ from tfeti_dolfinx.qp.friction_newton import (
     Law,
     LawPoint,
     LawProgram,
-    follow_friction,
     newton_on_law,
 )
 from tfeti_dolfinx.qp.newton import multipliers_at
@@ -34,8 +33,6 @@ class CoulombParameters:
     newton: FrictionParameters = DEFAULT  # those of Newton's method on the law
     tries: int = 4  # how often that may end and its bounds not be at rest
     finer: float = 0.03  # factor on its target each time, and at least on its residual
-    # of the first residual: what points on the path of growing friction are solved to
-    path_target: float = 1e-3
     first: float = 1e-2  # relative tolerance of the first problem with given bounds
     # of the last change of bounds: that of the next one. Forces are less exact than displacements
     share: float = 0.01
@@ -346,15 +343,11 @@ class NewtonOnLaw:
         # Step 2: the target
         size = norm_over(qp.coarse.comm, qp.coarse.project(qp.d))
         target = min(self._share * self._rtol * size, parameters.finer * residual, aim)
-        # Step 3: Newton's method, or the path of growing friction where bodies are held
+        # Step 3: Newton's method
         end, steps = None, 0
         terms = max(norm * norm_over(dual.coarse.comm, start[0]), norm_over(dual.coarse.comm, qp.d))
         if target > parameters.rounding * terms:
             end, steps = newton_on_law(program, first, target, parameters.newton)
-            if end is None and not dual.coarse.unheld.free.any():
-                loose = parameters.path_target * residual
-                end, more = follow_friction(program, first, target, loose, parameters.newton)
-                steps += more
         self.steps, self._share = self.steps + steps, parameters.finer * self._share
         self.tries -= 1
         if end is None:
