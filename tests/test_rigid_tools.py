@@ -409,6 +409,24 @@ def test_a_tool_that_no_nonlinear_body_balances_is_named(finite):
         nonlinear(finite, tool).solve()
 
 
+@pytest.mark.parametrize("reach", [None, 5.0])
+def test_a_body_that_was_pushed_stays_when_the_tool_goes_back(reach):
+    """Nothing holds it or drives it: its motion counts from where it is, on rollers."""
+    decomposition = decomposed("triangle", 6, 4)
+    V, _, v = vectors(decomposition)
+    u = fem.Function(V)
+    residual = ufl.derivative(neo_hooke(u, 1.0, 0.3) * ufl.dx, u, v) + 0.01 * v[1] * ufl.dx
+    law = lambda t: (np.interp(t, [0, 1, 2], [0, 1, 0]), 0.0)  # noqa: E731
+    plane = tfeti.Plane((0, 0), normal=(1, 0))
+    plate = tfeti.Obstacle("left", plane, displacement=law, reach=reach)
+    bcs = held(decomposition, "bottom")(V)
+    problem = tfeti.NonlinearContactProblem(residual, u, bcs, [plate], decomposition, finite=True)
+    for problem.time in (0.5, 1.0, 1.2, 2.0):
+        problem.solve()
+        problem.accept()
+        assert np.allclose(u.x.array.reshape(-1, 2), (min(problem.time, 1.0), 0.0), atol=0.02)
+
+
 @pytest.mark.parametrize("kind", ["linear", "nonlinear"])
 def test_a_tool_without_mass_is_named_in_dynamics(kind):
     scene, mass = block(2, n=2), {"mass": 1.0}

@@ -31,6 +31,7 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts,
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.feti.recovery import nearest
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import check_mesh, check_same_space, displacement_space
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
@@ -147,6 +148,8 @@ class ContactProblem:
         self._logged: set[str] = set()  # warnings
         self._solution: Solution | None = None
         self._start: Start | None = None
+        # in primal order, what free motions count from; None: from no displacement
+        self._near: Array | None = None
         self._accepted: tuple[Solution | None, Start | None] = (None, None)
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
@@ -288,7 +291,11 @@ class ContactProblem:
             multipliers = Multipliers(result.lam.copy(), result.face)
             nodal = dual.subdomains.num_nodal
             system.tools.take(accuracy.u[nodal:])
-            u = accuracy.u[:nodal]
+            u = accuracy.u
+            if self._near is not None and accuracy.recovered is not None:
+                near = np.concatenate((self._near, u[nodal:]))
+                u = nearest(dual.coarse, accuracy.recovered, near)
+            u = u[:nodal]
             solution = self._solution = self._make_solution(u, multipliers, gluing)
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         end = gluing, solution.lam, result.mu, system.inverses

@@ -36,7 +36,7 @@ class ContactSearch:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
         length: Length of the scene.
         records: All conditions of this rank; those ``within_reach`` get rows.
-        said: Contacts that ``warn_of`` has named last.
+        said: Contacts that ``warn_of`` has named.
     """
 
     def __init__(
@@ -184,9 +184,10 @@ class ContactSearch:
 
     def warn_of(self, unmet: list[str]) -> None:
         """Log on rank 0 which contacts have met nobody, once."""
-        before, self.said = self.said, unmet
-        for contact in self.said:
-            if self._dofs.comm.rank == 0 and contact not in before:
+        new = [contact for contact in unmet if contact not in self.said]
+        self.said = self.said + new
+        for contact in new:
+            if self._dofs.comm.rank == 0:
                 log.warning("contact %s has nothing within reach, and no constraints", contact)
 
     def _approach(self, contact: ContactPartner, u: Array) -> float:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, summed
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.feti.coarse import CoarseSpace
+from tfeti_dolfinx.feti.rigid_bodies import orthonormal_columns
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -75,6 +77,28 @@ def recover(
     active[coarse.rubbing] = True
     active &= face.carrying
     return Recovered(np.array(lam), u, gap, residual, active)
+
+
+def nearest(coarse: CoarseSpace, state: Recovered, rest: Array) -> Array:
+    """Return of displacements that are as right as one the nearest to another. Collective.
+
+    Motions that no active row holds go as far as the gaps of the other rows allow.
+
+    Args:
+        coarse: The coarse space.
+        state: The displacement, with its gaps and active rows.
+        rest: The other one, shape ``(n,)``.
+    """
+    N = orthonormal_columns(coarse.unresisted(state.active).columns)
+    if not (N := bcast_from_root(coarse.comm, N)).shape[1]:
+        return state.u
+    alpha = coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(rest - state.u)))
+    closing = coarse.Gt @ alpha
+    rows = coarse.bounded
+    rows = rows[(closing[rows] > 0.0) & ~state.active[rows]]
+    allowed = np.maximum(state.gap[rows], 0.0) / closing[rows]
+    share = coarse.comm.allreduce(float(allowed.min(initial=1.0)), op=MPI.MIN)
+    return np.asarray(state.u + share * coarse.kernel_motion(alpha))
 
 
 def elastic_displacement(

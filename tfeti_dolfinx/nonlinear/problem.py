@@ -276,6 +276,7 @@ class NonlinearContactProblem(ContactProblem):
         """Solve the contact problem of the model at u; the last one warns. Collective."""
         warns &= self._settings.options.warnings
         self.options = replace(self.options, rtol=rtol, warnings=warns)
+        self._near = self.dofs.to_primal(self.u.x.array)
         if self._places is not None:
             self._go_to_places(self._places)
         try:
