@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from bodies import boxes
 from dolfinx import fem
+from mpi4py import MPI
 from scenes import box, clamp, decomposed, forms, hooke, problem
 
 import tfeti_dolfinx as tfeti
@@ -44,6 +45,18 @@ def test_a_row_is_right_or_warned_of_or_named(ladder, cell, value, right, comm):
 def rung(name, cell, value):
     """A rung of the ladder of this name."""
     return next(ladder for ladder in LADDERS if ladder.name == name).rung(cell, value)
+
+
+@pytest.mark.parametrize(
+    ("name", "friendly", "hard", "times"),
+    [("Coulomb, moduli", 1.0, 1e4, 3.0), ("Coulomb, nu", 0.3, 0.499, 4.0)],
+)
+def test_rubber_on_steel_with_friction_costs_a_few_times_the_friendly_pair(
+    name, friendly, hard, times, serial_only
+):
+    rows = [run_scene(rung(name, "hexahedron", v), MPI.COMM_WORLD) for v in (friendly, hard)]
+    few, many = (row["F"] for row in rows)
+    assert many <= times * few
 
 
 def warnings_of(words, found):

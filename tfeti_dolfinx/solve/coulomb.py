@@ -119,7 +119,7 @@ def solve_with_friction(
         # Step 2: its forces of normals, beside those that the bounds are of
         change = bounds.change(result.lam)
         near = change <= parameters.near * tolerance
-        aim = rule.tolerance if asked <= least else np.inf  # of a coarser look nothing follows
+        aim = rule.tolerance * min(1.0, least / asked)  # residuals and errors fall together
         # Step 3: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
             if goal is not None or bounds.fit(result, rule):
