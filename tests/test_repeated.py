@@ -22,7 +22,7 @@ MADE_ONCE = {"stiffness", "search", "constraints", "factors", "trace", "coarse p
 class Repeated:
     """A box on a curved obstacle, clamped on the left, that takes other data."""
 
-    def __init__(self, cell="hexahedron", contact=True, parts=6, **options):
+    def __init__(self, cell="hexahedron", contact=True, parts=6, friction=None, **options):
         d = decomposed(cell, 4, parts)
         gdim = d.mesh.geometry.dim
         V, u, v = vectors(d)
@@ -31,11 +31,12 @@ class Repeated:
         self.E = fem.Constant(d.mesh, 1.0)
         self.load = fem.Constant(d.mesh, np.array([0.0] * (gdim - 1) + [-0.05]))
         self.held = fem.Constant(d.mesh, np.zeros(gdim))
+        obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2, friction=friction)
         self.problem = tfeti.ContactProblem(
             self.E * ufl.inner(hooke()(u), strain(v)) * dx,
             ufl.dot(self.load, v) * ds(d.surface("top")),
             [clamp(V, d.facets("left"), self.held)],
-            [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2)] if contact else [],
+            [obstacle] if contact else [],
             d,
             petsc_options={"rtol": 1e-10, **options},
         )
@@ -127,6 +128,13 @@ def counted(solve):
         sys.setprofile(None)
         _spbase.__init__ = make
     return calls["call"], matrices["made"]
+
+
+@pytest.mark.parametrize(("cell", "most"), [("triangle", 100), ("hexahedron", 150)])
+def test_a_solve_with_friction_makes_few_sparse_matrices(cell, most):
+    scene = Repeated(cell, parts=8, friction=tfeti.Coulomb(0.3))
+    assert counted(scene.solve)[1] <= most
+    scene.problem.destroy()
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])

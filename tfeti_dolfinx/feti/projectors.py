@@ -79,8 +79,11 @@ class Grams:
             data += damping * self.whole.data
         gram = csr_array((data, *self._table), shape=(size, size))
         if tangents:
-            along = face.T.T @ self.Gt
-            gram = gram + replicated(along.T.tocsr() @ along, self.comm)
+            count, width = face.tangents.shape
+            each = rows_of(self.Gt, face.tangent_rows.ravel(), face.tangents.ravel())
+            # the rows of a tangent as one, in which a column may stand more than once
+            along = each._replace(indptr=each.indptr[::width], shape=(count, size))
+            gram = gram + replicated(transposed(along).csr() @ along.csr(), self.comm)
         return gram
 
 

@@ -9,9 +9,9 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import csr_array, hstack
+from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, beside, transposed
 from tfeti_dolfinx.errors import InputError
 
 # --- Faces ------------------------------------------------------------------------------------
@@ -73,20 +73,15 @@ class Face:
         return held
 
     @cached_property
-    def T(self) -> csr_array:
-        """The tangents as columns, scipy CSR, shape ``(m, t)``."""
-        count, width = self.tangents.shape
-        table = np.arange(0, count * width + 1, width or 1)[: count + 1]
-        values = self.tangents.ravel(), self.tangent_rows.ravel(), table
-        return csr_array(csr_array(values, shape=(count, len(self.free))).T)
-
-    @cached_property
     def Z(self) -> csr_array:
         """All directions as columns, coordinates first, scipy CSR, shape ``(m, k)``."""
         rows, m = np.flatnonzero(self.free), len(self.free)
         own = np.cumsum(np.append(0, self.free))
-        coordinates = csr_array((np.ones(len(rows)), np.arange(len(rows)), own), (m, len(rows)))
-        return csr_array(hstack((coordinates, self.T))) if len(self.tangents) else coordinates
+        coordinates = Entries(np.ones(len(rows)), np.arange(len(rows)), own, (m, len(rows)))
+        count, width = self.tangents.shape
+        table = np.arange(0, count * width + 1, width or 1)[: count + 1]
+        values = self.tangents.ravel(), self.tangent_rows.ravel(), table
+        return beside(coordinates, transposed(Entries(*values, (count, m)))).csr()
 
     @property
     def bends(self) -> Array:
