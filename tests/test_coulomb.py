@@ -74,16 +74,20 @@ def test_a_block_that_is_drawn_along_slides_at_its_capacity(comm):
 
 
 @pytest.mark.parametrize(
-    ("cell", "mu", "tilt", "size", "rtol", "shares"),
+    ("cell", "mu", "tilt", "size", "rtol", "shares", "kind_of"),
     [
         # directions of a face that holds the block by rounding alone do not balance any load
-        ("quadrilateral", 0.1, 0.1, (8, 4), 1e-6, (0.5, 0.9, 0.96, 0.97, 0.99, 0.5, 0.99)),
+        ("quadrilateral", 0.1, 0.1, (8, 4), 1e-6, (0.5, 0.9, 0.96, 0.97, 0.99, 0.5, 0.99), "auto"),
         # rows that slip and stick by turns
-        ("quadrilateral", 0.05, 0.1, (12, 6), 1e-9, (0.5, 0.75, 0.589, 0.01, 0.99)),
-        ("triangle", 0.05, 0.1, (12, 6), 1e-9, (0.5, 0.75, 0.589, 0.01, 0.99)),
+        ("quadrilateral", 0.05, 0.1, (12, 6), 1e-9, (0.5, 0.75, 0.589, 0.01, 0.99), "auto"),
+        ("triangle", 0.05, 0.1, (12, 6), 1e-9, (0.5, 0.75, 0.589, 0.01, 0.99), "auto"),
+        # bounds of the step before do not hold the block
+        ("quadrilateral", 0.5, 1.0, (8, 4), 1e-6, (0.1, 0.9), "fixed_point"),
     ],
 )
-def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(cell, mu, tilt, size, rtol, shares):
+def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(
+    cell, mu, tilt, size, rtol, shares, kind_of
+):
     """Shares of the way from the force at which it slides down to the one at which it goes up."""
     kind = getattr(mesh.CellType, cell)
     whole = mesh.create_rectangle(MPI.COMM_WORLD, [(0, 0), (4, 2)], size, kind)
@@ -105,7 +109,7 @@ def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(cell, mu, tilt, s
         problem.solve()
         return problem
 
-    options, warm = {"rtol": rtol}, None
+    options, warm = {"rtol": rtol, "friction_type": kind_of}, None
     for share in shares:
         warm = solved(share, warm)
         cold = solved(share)
