@@ -201,7 +201,6 @@ class Accuracy(StoppingRule):
 
     Attributes:
         tolerance: Norm of the residuals from which on one looks (again).
-        drifted: Whether the solver's gradient has to be made anew.
         recovered: What the last look has recovered.
         u: This rank's part of its displacement, shape ``(n,)``.
         looks: How many looks there were.
@@ -272,11 +271,10 @@ class Accuracy(StoppingRule):
             tolerance = max(tolerance, self._small)
         elif tolerance < least:  # the change since a poor iterate says little
             tolerance = residual * max(given.aim / max(own, 1.0), given.leap)
-        # 3. where the true residual lags behind the solver's: a new gradient, then rounding
+        # 3. where the true residual lags behind the solver's twice, rounding has the last word
         self._stalls = self._stalls + 1 if lags else 0
         if self._stalls > 1 or tolerance <= least:
             return ConvergedReason.DIVERGED_ROUNDING
-        self.drifted = self._stalls > 0
         self.tolerance, self._claimed = float(tolerance), residual
         return ConvergedReason.ITERATING
 

@@ -162,9 +162,9 @@ def pcpg(
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone; the feasible set is kept by
-    nobody. Multiplies by F, and by the preconditioner, once per step, and once more where the rule
-    finds that g has drifted. A step makes three global reductions: one with each projection, one
-    for the norm of the residual; one more where there are directions of earlier solves.
+    nobody. Multiplies by F, and by the preconditioner, once per step. A step makes three global
+    reductions: one with each projection, one for the norm of the residual; one more where there are
+    directions of earlier solves.
 
     ===========================  ===================================================
     reason                       when
@@ -188,10 +188,6 @@ def pcpg(
         # test
         small = norm <= rule.tolerance
         reason = _examined(qp, point, rule, norm) if small else ConvergedReason.ITERATING
-        if rule.drifted:
-            point.g = qp.at(point.lam).g
-            rule.drifted, own.fresh = False, True
-            past, norm = _begun(qp, point, own)
         if reason == ConvergedReason.ITERATING and progress.stagnates(qp, point):
             reason = ConvergedReason.DIVERGED_ROUNDING
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:

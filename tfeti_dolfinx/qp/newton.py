@@ -534,10 +534,6 @@ def newton(
             state.look()
             monitor(steps, "outer", state.z.lam, state.residual, 0.0)
             reason = state.examine(rule)
-            if rule.drifted:
-                state.z = qp.at(state.z.lam)
-                state.resume = rule.drifted = False
-                continue
             if reason == ConvergedReason.ITERATING and max(steps.outer, steps.cg) >= max_it:
                 reason = ConvergedReason.DIVERGED_ITS
             if reason != ConvergedReason.ITERATING:

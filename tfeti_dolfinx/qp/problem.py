@@ -275,9 +275,6 @@ class StoppingRule:
     """
 
     tolerance: float  # norm of the residuals from which on an examination is worth its price
-    # set where an examination finds that the solver's gradient is no longer true; the solver makes
-    # it anew and takes the flag back
-    drifted: bool = False
     # ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that learns it on
     # its way says so here
     norm: float = 1.0

@@ -90,7 +90,7 @@ class InnerTest:
         gradient = state.projected_gradient
         if max(gradient, self._qp.norm * equality) <= self._rule.tolerance:
             self.examine(state, equality)
-        if self.reason != ConvergedReason.ITERATING or self._rule.drifted:
+        if self.reason != ConvergedReason.ITERATING:
             return True
         wanted = max(self.M * equality, self._parameters.enough * self._rule.tolerance)
         return gradient <= min(wanted, self._eta)
@@ -185,11 +185,6 @@ def smalse(
         reason = test.reason or broken or ConvergedReason.ITERATING
         if reason != ConvergedReason.ITERATING:
             break
-        if rule.drifted:
-            state.g = A(x) - b + y
-            state.split()
-            rule.drifted = False
-            continue
         # Step 4 needs L(x, μ) = ½xᵀAx − bᵀx + yᵀx before the update, g = Ax − b + y
         lagrangian = 0.5 * sum(qp.dot((x, state.g), (x, y - b)))
         # Step 3: update multipliers
