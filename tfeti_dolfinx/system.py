@@ -391,22 +391,19 @@ class System:
             self.change("load")
 
     def _find_contacts(self) -> None:
-        dofs, tools = self._dofs, self.tools
-        first, said = (
-            self._search is None,
-            list[str]() if self._search is None else self._search.said,
-        )
+        dofs, tools, before = self._dofs, self.tools, self._search
         tools.place(finite=self.origin is not None)
         contacts = [
             replace(contact, secondary=side) if isinstance(contact, Contact) else contact
             for contact, side in zip(tools.placed(self._contacts), self._secondary, strict=True)
         ]
-        decided = not first or self._known_rows is not None
+        decided = before is not None or self._known_rows is not None
         stiffness = None if decided else self._blocks
         self._search = ContactSearch(contacts, dofs, stiffness, self.origin, tools)
-        self._search.said = said
-        if first:
+        if before is None:
             tools.check_begin(contacts, self._search.records)
+        else:
+            self._search.said = before.said
         # its sides stay
         self._secondary = [contact.surfaces[0] for contact in self._search.contacts]
         if self._known_rows is not None:

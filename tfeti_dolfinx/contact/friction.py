@@ -175,13 +175,16 @@ def with_friction(
 
 
 def friction_values(
-    name: str, friction: FrictionLaw, records: ContactRecords, dofs: TornDofs
+    name: str, friction: FrictionLaw | None, records: ContactRecords, dofs: TornDofs
 ) -> Array:
-    """Bounds or coefficients of conditions along tangents, ``(n, gdim - 1)``. Collective.
+    """Bounds or coefficients of conditions along tangents, ``(n, gdim - 1)``, 0 without a law.
 
+    Collective.
     Raise an InputError where a value is negative or no number somewhere, or a function on another
     mesh; the message begins with the contact's name.
     """
+    if friction is None:
+        return np.zeros((len(records), dofs.bs - 1))
     x, what = group_points(dofs)[records.group], f"{name}: {friction.what}"
     columns = []
     for value in friction.values:

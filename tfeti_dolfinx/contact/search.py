@@ -73,14 +73,10 @@ class ContactSearch:
 
         Shape ``(n, gdim - 1)``. Raise an InputError where one is negative or no number.
         """
-        parts = [np.zeros((0, max(self._dofs.bs - 1, 0)))]
-        for contact, records in zip(self.contacts, self._records, strict=True):
-            if contact.friction is None:
-                parts.append(np.zeros((len(records), parts[0].shape[1])))
-            else:
-                found = friction_values(contact.name, contact.friction, records, self._dofs)
-                parts.append(found)
-        return np.concatenate(parts)
+        none = np.zeros((0, self._dofs.bs - 1))
+        pairs = zip(self.contacts, self._records, strict=True)
+        found = [friction_values(c.name, c.friction, records, self._dofs) for c, records in pairs]
+        return np.concatenate([none, *found])
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
         """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
