@@ -211,12 +211,14 @@ def shorten_signature(
         return "", returns
     if is_dataclass(obj) and re.search(r"~|<factory>|\b_", signature):
         parts: list[str] = []
-        for field in fields(obj):
+        for field in sorted(fields(obj), key=lambda field: field.kw_only):
             parts += ["*"] * (field.kw_only and "*" not in parts)
             default = "" if field.default is MISSING else f" = {field.default!r}"
             default = default if field.default_factory is MISSING else " = ..."
             default = re.sub(r"<function (\w+) at \w+>", r"\1", default)
-            parts += [f"{field.name}: {field.type}{default}"] * (not field.name.startswith("_"))
+            parts += [f"{field.name}: {field.type}{default}"] * (
+                field.init and field.name[0] != "_"
+            )
         return f"({', '.join(parts)})", returns
     return None
 
