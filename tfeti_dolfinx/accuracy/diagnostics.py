@@ -195,10 +195,11 @@ class Diagnostics:
         u = subdomains.with_rigid(u)
         bent = u - subdomains.modes_motion(motions.amounts(motions.part_of(u)))
         diagonal = joined([block.diagonal for block in subdomains.blocks])
-        energy, terms = subdomains.body_sums(
-            [subdomains.energies(u), sums(diagonal * bent**2, subdomains.dof_parts)]
-        )
-        known = energy > EPSILON * energy.max(initial=0.0)
+        parts = subdomains.dof_parts
+        squares = [sums(diagonal * of**2, parts) for of in (bent, u)]
+        energy, terms, moved = subdomains.body_sums([subdomains.energies(u), *squares])
+        # that of a body which only moves is rounding
+        known = energy > EPSILON * np.maximum(energy, EPSILON * moved).max(initial=0.0)
         share = (
             LIMITS.rounding
             * EPSILON

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, least, summed
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.rigid_bodies import orthonormal_columns
@@ -79,7 +78,7 @@ def recover(
     return Recovered(np.array(lam), u, gap, residual, active)
 
 
-def nearest(coarse: CoarseSpace, state: Recovered, rest: Array) -> Array:
+def nearest(coarse: CoarseSpace, state: Recovered, rest: Array, nothing: float = 1e-10) -> Array:
     """Return of displacements that are as right as one the nearest to another. Collective.
 
     Motions that no active row holds go as far as the gaps of the other rows allow.
@@ -88,6 +87,7 @@ def nearest(coarse: CoarseSpace, state: Recovered, rest: Array) -> Array:
         coarse: The coarse space.
         state: The displacement, with its gaps and active rows.
         rest: The other one, shape ``(n,)``.
+        nothing: Share of the largest change of a gap that is rounding.
     """
     N = orthonormal_columns(coarse.unresisted(state.active).columns)
     if not (N := bcast_from_root(coarse.comm, N)).shape[1]:
@@ -95,9 +95,10 @@ def nearest(coarse: CoarseSpace, state: Recovered, rest: Array) -> Array:
     alpha = coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(rest - state.u)))
     closing = coarse.Gt @ alpha
     rows = coarse.bounded
-    rows = rows[(closing[rows] > 0.0) & ~state.active[rows]]
+    rounding = nothing * largest(coarse.comm, closing[rows])
+    rows = rows[(closing[rows] > rounding) & ~state.active[rows]]
     allowed = np.maximum(state.gap[rows], 0.0) / closing[rows]
-    share = coarse.comm.allreduce(float(allowed.min(initial=1.0)), op=MPI.MIN)
+    share = least(coarse.comm, float(allowed.min(initial=1.0)))
     return np.asarray(state.u + share * coarse.kernel_motion(alpha))
 
 

@@ -21,6 +21,8 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # degree of the quadrature whose points det F is looked at
 DEGREE = 4
+# of |J| |u|: a load less than this is its rounding, and that of F
+ROUNDING = 32.0 * float(np.finfo(float).eps)
 
 
 class NewtonForms(Forms):
@@ -64,11 +66,13 @@ class NewtonForms(Forms):
         return self._matrix
 
     def load(self) -> Array:
-        """Return this rank's J u − F(u)."""
+        """Return this rank's J u − F(u), 0 where it is rounding: that would drive free bodies."""
         assert self._matrix is not None  # stages make it before
-        owned = self._matrix.shape[1]
+        u = self._u.x.array[: self._matrix.shape[1]]
         self.at_model = self.residual() if self.known is None else self.known
-        return np.asarray(self._matrix @ self._u.x.array[:owned] - self.at_model)
+        found = self._matrix @ u - self.at_model
+        found[abs(found) <= ROUNDING * (abs(self._matrix) @ abs(u))] = 0.0
+        return np.asarray(found)
 
     def tangent_times(self, d: Array) -> Array:
         """Return this rank's J(u) d."""
