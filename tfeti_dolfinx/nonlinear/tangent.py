@@ -64,16 +64,15 @@ def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
     deformation = ufl.Identity(len(u)) + ufl.grad(u)
     inverse = ufl.inv(deformation)
 
-    def strain(y: Any) -> Any:
-        return ufl.sym(deformation.T * ufl.grad(y))
+    def stretched(y: Any) -> Any:
+        return inverse.T * ufl.sym(deformation.T * ufl.grad(y))
 
-    def geometric(of_w: Any, of_v: Any) -> ufl.Form:
-        gradient = (of_w * inverse).T * of_v
-        return map_integrand_dags(GradientReplaced(v, gradient), inside)
+    def moved(of_w: Any, of_v: Any) -> Any:
+        return (of_w * inverse).T * of_v
 
-    whole = geometric(ufl.grad(w), ufl.grad(v))
-    of_stretches = geometric(inverse.T * strain(w), inverse.T * strain(v))
-    return tangent - whole + of_stretches
+    # F is linear in ∇v: the difference of both geometric parts is that of one gradient
+    gradient = moved(stretched(w), stretched(v)) - moved(ufl.grad(w), ufl.grad(v))
+    return tangent + map_integrand_dags(GradientReplaced(v, gradient), inside)
 
 
 def _has_gradient_of(expression: Any, u: fem.Function) -> bool:
