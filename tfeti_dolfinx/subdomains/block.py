@@ -9,6 +9,7 @@ from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.errors import InputError
@@ -115,9 +116,10 @@ def kernel_of(K: Any, modes: Array) -> Array:
     # In flat cells entries are differences of far larger numbers, which are as large as those that
     # other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
     largest = np.maximum.reduceat(K.diagonal()[K.indices], K.indptr[:-1])
-    sizes = (np.sqrt(largest)[:, None] * np.abs(R)).T
-    terms = [size @ np.add.reduceat(size[K.indices], K.indptr[:-1]) for size in sizes]
-    return np.asarray(R[:, energy <= TOLERANCES.null * np.array(terms)])
+    sizes = np.sqrt(largest)[:, None] * np.abs(R)
+    pattern = csr_array((np.ones(len(K.data)), K.indices, K.indptr), shape=K.shape)
+    terms = np.sum(sizes * (pattern @ sizes), axis=0)
+    return np.asarray(R[:, energy <= TOLERANCES.null * terms])
 
 
 def fixing_nodes(x: Array, count: int) -> Array:

@@ -68,15 +68,12 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     # what moves in no motion may be far stiffer
     moves = np.abs(R).max(axis=1) > TOLERANCES.still * np.abs(R).max()
     added = K.diagonal()[moves].max() * (Q @ Q.T)
-    # behind the entries of these rows, and then summed up
     count = len(fixing_dofs)
-    at = np.repeat(K.indptr[fixing_dofs + 1], count)
-    columns = np.insert(K.indices, at, np.tile(fixing_dofs, count))
-    table = K.indptr + count * np.searchsorted(fixing_dofs, np.arange(len(K.indptr)))
-    result = csr_array((np.insert(K.data, at, added.ravel()), columns, table), shape=K.shape)
-    result.sum_duplicates()
-    result.eliminate_zeros()
-    return result
+    table = np.zeros(K.shape[0] + 1, dtype=K.indptr.dtype)
+    table[fixing_dofs + 1] = count
+    columns = np.tile(fixing_dofs, count).astype(K.indices.dtype)
+    added = csr_array((added.ravel(), columns, np.cumsum(table, dtype=table.dtype)), shape=K.shape)
+    return K + added  # of scipy, which leaves out what is 0
 
 
 @dataclass(frozen=True)
