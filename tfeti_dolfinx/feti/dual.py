@@ -58,6 +58,9 @@ class DualLimits:
     # directions kept where options do not say how many: later ones gain hardly anything, and each
     # takes two vectors
     recycled: int = 200
+    # in space, stiffness of springs that rows begin on over that of a half space: a ball touches
+    # such springs, which do not move their neighbours, on a larger area than a half space
+    stiffer: float = 1.5
 
 
 LIMITS = DualLimits()
@@ -281,9 +284,12 @@ class Dual:
         """Return −σc/n^(1/(d − 1)) for n rows that carry together, on local rows. Collective.
 
         One scaled row has about the stiffness σ of its nodes. Under n neighbours that are pressed
-        alike a half space gives way by so many times as much, as their width says.
+        alike a half space gives way by so many times as much, as their width says; in space σ is
+        half as large again.
         """
         sigma = mean_stiffness(self.subdomains, self.constraints.weights)
+        if self._dimension > 2:
+            sigma *= LIMITS.stiffer
         softer = count ** (1.0 / max(self._dimension - 1, 1))
         return np.asarray(-sigma / softer * self.constraints.c)
 
