@@ -268,7 +268,8 @@ class ContactProblem:
         """Solve with the present rows, from the last solution on; return what may overlap, too."""
         system, seconds, d = self._system, self._seconds, self.decomposition
         dual, gluing = system.make(seconds), system.gluing
-        options = replace(system.options, rtol=self.options.rtol, warnings=self.options.warnings)
+        now = self.options
+        options = replace(system.options, rtol=now.rtol, atol=now.atol, warnings=now.warnings)
         dual.forget_counts()
         # 1. the multipliers
         with stage("solve", seconds):

@@ -49,8 +49,8 @@ class NonlinearContactProblem(ContactProblem):
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
        gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0) is the remainder.
     3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with a new model
-       of where the bodies are; in small strain where the remainder times ‖d‖ is, which the next one
-       is expected to be.
+       of where the bodies are, or the last digit of that; in small strain where the remainder
+       times ‖d‖ is, which the next one is expected to be.
     4. *Step.* u ← u + t d; whole steps in finite strain, where J is not the derivative of F, and
        where J is kept, are accelerated by Anderson's method. It begins anew at a shortened step.
 
@@ -125,11 +125,13 @@ class NonlinearContactProblem(ContactProblem):
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
-        self._exact = self.options.number
+        self._exact, self._atol = self.options.number, self.options.atol
         self._system.follows = True
         self._first = self._begin = np.array(u.x.array)
         length = bcast_from_root(decomposition.comm, diameter(decomposition))
         self._least = self._tolerances.nowhere * length if finite else 0.0
+        # of where bodies are
+        self._last_digit = float(np.finfo(float).eps) * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
         self._last_increment = self._loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
@@ -174,7 +176,7 @@ class NonlinearContactProblem(ContactProblem):
             raise
         finally:
             warns = self._settings.options.warnings
-            self.options = replace(self.options, rtol=self._exact, warnings=warns)
+            self.options = replace(self.options, rtol=self._exact, atol=self._atol, warnings=warns)
             self.report.take(total.entered(self.report))
         return self.u
 
@@ -201,7 +203,7 @@ class NonlinearContactProblem(ContactProblem):
             end = np.array(self.u.x.array)
             d = end - u
             size = largest(comm, d)
-            increment = size / max(largest(comm, self.u.x.array), TINY)
+            increment = size / max(largest(comm, end), TINY) if size > self._last_digit else 0.0
             # 2. line search
             t, remainder = self._line_search(u, d)
             expected = asked = min(remainder, 1.0) * increment
@@ -275,7 +277,8 @@ class NonlinearContactProblem(ContactProblem):
     def _solve_linearised(self, rtol: float, warns: bool) -> None:
         """Solve the contact problem of the model at u; the last one warns. Collective."""
         warns &= self._settings.options.warnings
-        self.options = replace(self.options, rtol=rtol, warnings=warns)
+        atol = max(self._atol, self._last_digit)
+        self.options = replace(self.options, rtol=rtol, atol=atol, warnings=warns)
         self._near = self.dofs.to_primal(self.u.x.array)
         if self._places is not None:
             self._go_to_places(self._places)
