@@ -32,8 +32,6 @@ class NewtonTolerances:
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
-        final: Share of ``rtol`` to which the last linearised problems are solved at least, so that
-            increments can fall below ``rtol``.
         curvature: A step is shortened where the residual along it, contact forces included, has
             at its end more than this share of its value at its begin, with the other sign.
         max_line_search: Most residuals that a line search assembles.
@@ -70,7 +68,6 @@ class NewtonTolerances:
     flattest: float = 0.25
     nothing: float = 1e-12
     nowhere: float = 1e-13
-    final: float = 0.5
     curvature: float = 0.5
     max_line_search: int = 12
     rounding: float = 1e-11

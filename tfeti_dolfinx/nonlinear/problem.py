@@ -190,7 +190,7 @@ class NonlinearContactProblem(ContactProblem):
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
-            rtol = float(np.clip(self._forcing * asked, tol.final * exact, self._loosest))
+            rtol = float(np.clip(self._forcing * asked, exact, self._loosest))
             try:
                 self._solve_linearised(rtol, warns=step == 0 or rtol <= exact)
             except OverlapError as error:  # that of an iterate, not of what was given
