@@ -33,6 +33,9 @@ class CoulombParameters:
     newton: FrictionParameters = DEFAULT  # those of Newton's method on the law
     tries: int = 4  # how often that may end and its bounds not be at rest
     finer: float = 0.03  # factor on its target each time, and at least on its residual
+    # its target at most, over the tolerance that a look leaves to a solve, which is half of what
+    # an answer needs
+    looser: float = 2.0
     first: float = 1e-2  # relative tolerance of the first problem with given bounds
     # of the last change of bounds: that of the next one. Forces are less exact than displacements
     share: float = 0.01
@@ -119,7 +122,8 @@ def solve_with_friction(
         # Step 2: its forces of normals, beside those that the bounds are of
         change = bounds.change(result.lam)
         near = change <= parameters.near * tolerance
-        aim = rule.tolerance * min(1.0, least / asked)  # residuals and errors fall together
+        # residuals and errors fall together
+        aim = parameters.looser * rule.tolerance * min(1.0, least / asked)
         # Step 3: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
             if goal is not None or bounds.fit(result, rule):
