@@ -33,8 +33,8 @@ class CoulombParameters:
     newton: FrictionParameters = DEFAULT  # those of Newton's method on the law
     tries: int = 4  # how often that may end and its bounds not be at rest
     finer: float = 0.03  # factor on its target each time, and at least on its residual
-    # its target at most, over the tolerance that a look leaves to a solve, which is half of what
-    # an answer needs
+    # its target at most, over the tolerance that a look leaves to a solve. Looks leave half of
+    # what an answer needs (StoppingTolerances.aim), bar where a bound or a leap limits them
     looser: float = 2.0
     first: float = 1e-2  # relative tolerance of the first problem with given bounds
     # of the last change of bounds: that of the next one. Forces are less exact than displacements
