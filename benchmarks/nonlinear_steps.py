@@ -11,9 +11,8 @@ import sys
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
-from benchmarks.tools import Tables, command_line, markdown, write_documents, write_tables
+from benchmarks.tools import Tables, command_line, finish, say
 from demos import steps_of
 
 DEMOS = (
@@ -62,14 +61,9 @@ def main(argv: list[str]) -> Tables:
     rows = []
     for name in arguments.only or runs:
         rows.append(row(name, [*runs[name], *options]))
-        if MPI.COMM_WORLD.rank == 0:
-            print(markdown(rows[-1:]).splitlines()[-1], flush=True)
+        say(rows[-1])
     tables = {f"Load steps of {'large ' * arguments.large}nonlinear demos": rows}
-    if MPI.COMM_WORLD.rank == 0:
-        write_tables(arguments.output, "nonlinear_steps", tables)
-        if arguments.document:
-            write_documents("nonlinear_steps", tables, arguments.document)
-    return tables
+    return finish(arguments, "nonlinear_steps", tables)
 
 
 def configure(parser: Any) -> None:

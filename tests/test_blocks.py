@@ -118,7 +118,7 @@ def test_what_is_wrong_with_stiffness_or_load_is_named(change, load, message):
     ("share", "message"),
     [
         (1e-3, "the stiffness is not positive semidefinite; expected a linear"),
-        (0.0, "the form gives no energy to 1 motion besides the 6 of a rigid body"),
+        (0.0, "the form gives no energy to motions besides the 6 of a rigid body"),
     ],
 )
 def test_a_negative_energy_is_told_from_none(share, message):
@@ -142,21 +142,15 @@ WITHOUT = [("triangle", "div-div"), ("quadrilateral", "one point"), ("hexahedron
 
 
 @pytest.mark.parametrize(("cell", "energy"), WITHOUT)
-def test_motions_without_energy_are_counted(cell, energy):
-    """As many as dense eigenvalues say; rounding alone decided whether a factor was made."""
+def test_motions_without_energy_are_named(cell, energy):
+    """Rounding alone decides whether a factor is made."""
     d = decomposed(cell, 2, 1, comm=MPI.COMM_SELF)
     gdim = d.mesh.geometry.dim
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
     form = ENERGIES[energy](ufl.TrialFunction(V), ufl.TestFunction(V))
     K, x = csr_array(assemble_csr(fem.form(form))), V.tabulate_dof_coordinates()[:, :gdim]
-    values = np.linalg.eigvalsh(K.toarray())
     rigid = kernel_of(K, candidate_modes(x, gdim, x.mean(axis=0), 1.0)).shape[1]
-    free = int(np.sum(values < 1e-10 * values[-1])) - rigid
-    assert free > 0
-    count = f"{free} motion{'s' * (free > 1)}"
-    with pytest.raises(
-        InputError, match=f"the form gives no energy to {count} besides the {rigid} of a rigid body"
-    ):
+    with pytest.raises(InputError, match=f"gives no energy to motions besides the {rigid} of"):
         block(K, x)
 
 

@@ -132,6 +132,7 @@ class ContactProblem:
         V = displacement_space(a, decomposition, self.form_name)
         check_conditions(self.bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
+        self._first = np.array(self.u.x.array)
         self._given_stress = stress
         self._stress: Freezable | None = None
         if stress is not None:
@@ -215,16 +216,9 @@ class ContactProblem:
             FactorError: A matrix could not be factored.
         """
         self._meet("solve")
-        self._solve()
-        return self.u
-
-    def _solve(self) -> None:
-        """Solve with the data that ranks have met with. Collective; it raises what solve does."""
         self._counts, self._outcome = SolverCounts(), Outcome()
         try:
-            self._system.look_for_changes()
-            self._set_out()
-            self._solve_in_rounds()
+            self._find()
         except TfetiError as error:  # on all ranks
             if isinstance(error, NoSolutionError):
                 self._outcome = replace(self._outcome, converged_reason="NO_SOLUTION")
@@ -236,6 +230,13 @@ class ContactProblem:
         if self.options.view and self.decomposition.comm.rank == 0:
             options = self.options.view_text(self._settings.prefix)
             print(options, self.report.details(), sep="\n", flush=True)
+        return self.u
+
+    def _find(self) -> None:
+        """Find the solution, with the data that ranks have met with. Collective."""
+        self._system.look_for_changes()
+        self._set_out()
+        self._solve_in_rounds()
 
     def _solve_in_rounds(self) -> None:
         """Solve, with more and more contact rows, until no node without a row overlaps.
@@ -281,8 +282,8 @@ class ContactProblem:
                 start = gluing.multipliers(earlier, lam), mu
                 start = None if dual.is_far(*start) else start
             goal = None
-            if options.rtol == "auto" and self._stress is not None:
-                goal = goal_of(self._stress, self.dofs, self._thickness)
+            if options.rtol == "auto" and self._given_stress is not None:
+                goal = goal_of(self._given_stress, self.dofs, self._thickness)
             given, own = self._settings, self._settings.extensions.monitor
             with added_options(given.prefix, given.factor_options):  # of faces, and of a late S
                 solved = solve_with_friction(dual, options, options.qp_type, start, own, goal)
@@ -470,7 +471,7 @@ class ContactProblem:
         self._accepted = (solution, self._start)
 
     def go_back(self) -> None:
-        """Return to the last accepted solution, or to none. Collective.
+        """Return to the last accepted solution, or to what ``u`` was at first. Collective.
 
         The next ``solve`` starts from there. Loads, values and gaps stay as they are.
         """
@@ -483,7 +484,7 @@ class ContactProblem:
         self._solution, self._start = self._accepted
         self._system.tools.go_back()
         last = self._solution
-        self.u.x.array[:] = 0.0 if last is None else self.dofs.to_dolfinx(last.u)
+        self.u.x.array[:] = self._first if last is None else self.dofs.to_dolfinx(last.u)
 
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``. Collective.

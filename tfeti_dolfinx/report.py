@@ -93,7 +93,7 @@ class StageCounts:
 
 @dataclass
 class SolverCounts:
-    """Counts of a solver, which add up over solves with more and more contact rows."""
+    """Counts of a solver, which add up over linearised problems, and more and more rows."""
 
     late_contact_rows: int = 0  # of nodes out of reach that overlapped after a solve
     F_multiplications: int = 0  # all but the power method's
@@ -109,6 +109,7 @@ class SolverCounts:
     proportioning_steps: int = 0
     face_factorizations: int = 0  # of G_f G_fᵀ, f a face of the rows
     soft_factorizations: int = 0  # of soft motions, or of whole clusters, one for a face
+    newton_steps: int = 0  # of a nonlinear problem, each a linearised problem
 
     @classmethod
     def of_run(
@@ -130,8 +131,8 @@ class SolverCounts:
             cg_steps=steps.cg,
             expansion_steps=steps.expansion,
             proportioning_steps=steps.proportioning,
-            face_factorizations=dual.coarse.factors.count["face"],
-            soft_factorizations=0 if soft is None else soft.factors.count["face"],
+            face_factorizations=dual.coarse.factors.count,
+            soft_factorizations=0 if soft is None else soft.factors.count,
         )
 
 
@@ -308,7 +309,6 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
     fields of its bases are its own; docs/report.md says what each means.
     """
 
-    newton_steps: int = 0  # of a nonlinear problem, each a linearised problem
     seconds: dict[str, float] = field(default_factory=Seconds)  # of each stage, and ``total``
     motion: dict[str, float] = field(default_factory=dict)  # of bodies with mass: energies, work
     contact_forces: list[list[float]] = field(default_factory=list)  # of bodies with mass: means

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -128,12 +127,11 @@ def arranged(values: Array, kept: Array, here: Array) -> Array:
 
 # --- Saved state of a solution ----------------------------------------------------------------
 
-# vectors of all rows that the next solve starts from, if they are known
-STARTS = ("predicted", "image", "predicted_image")
 # what the rows of an array are: labels of this name tell them apart
 OF = {
     **dict.fromkeys(("u", "velocity", "load", "weights"), "nodes"),
-    **dict.fromkeys(("lam", "status", "directions", *STARTS), "rows"),
+    **dict.fromkeys(("lam", "status", "directions"), "rows"),
+    **dict.fromkeys(("predicted", "image", "predicted_image"), "rows"),
     **dict.fromkeys(("slip", "contact", "group", "reached"), "conditions"),
     "internal": "cells",
     "layout": "subdomains",
@@ -258,11 +256,8 @@ class SavedState:
             "rows": labels_of_rows(gluing, of_groups),
             "conditions": labels_of_conditions(gluing, of_groups),
         }
-        records, comm = gluing.records, gluing.dofs.comm
-        known = [name for name in STARTS if any_rank(comm, getattr(self, name).size > 0)]
-        with raised_on_all_ranks(comm):
-            for name in known:
-                _check_broken(name, len(getattr(self, name)) == len(self.rows))
+        records = gluing.records
+        with raised_on_all_ranks(gluing.dofs.comm):
             same = all(same_labels(getattr(self, kind), here[kind]) for kind in here)
             state = self._in_order(here) if same else self
             found = (state.contact, state.group, state.reached)
@@ -333,23 +328,15 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
             f"the state is of {len(state.reach)} contacts; expected those of the problem, "
             f"{contacts}"
         )
-    rows, unknowns = state.lam.shape, (len(dofs.dolfinx_node) * dofs.bs,)
-    conditions = state.conditions.shape
-    axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "secondary": 1, "contact": 1, "directions": 3}
-    shapes: dict[str, list[tuple[int, ...]]] = {name: [(0,), rows] for name in STARTS}
-    shapes |= {"u": [unknowns], "status": [rows], "rows": [rows], "norm": [()], "size": [()]}
-    shapes |= {name: [conditions] for name in ("contact", "group", "reached")}
     for f in fields(state):
-        values, name = getattr(state, f.name), f.name
-        right = name not in shapes or values.shape in shapes[name]
-        right &= values.ndim == axes.get(name, values.ndim)
-        right &= bool(np.all(np.isfinite(values)))
-        _check_broken(name, right)
+        values, kind = getattr(state, f.name), OF.get(f.name)
+        right = bool(np.all(np.isfinite(values)))
+        if kind is not None:
+            length = values.shape[1] if f.name == "directions" else len(values)
+            wanted = len(getattr(state, kind)) * (dofs.bs if kind == "nodes" else 1)
+            right &= length == wanted or (length == 0 and f.default_factory is not MISSING)
+        _check_broken(f.name, right)
     _check_broken("secondary", len(state.secondary) == contacts)
-    _check_broken("slip", len(state.slip) == len(state.conditions))
-    _check_broken(
-        "directions", state.directions.shape[1:] in {(0, 0), (*rows, *state.directions.shape[2:])}
-    )
     nodes = labels_of_nodes(dofs)
     _check_broken("nodes", same_labels(state.nodes, nodes))
     _check_broken("contact", bool(np.all((state.contact >= 0) & (state.contact < contacts))))

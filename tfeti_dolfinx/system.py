@@ -19,7 +19,7 @@ from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
 from tfeti_dolfinx.contact.records import ContactRecords, condition_areas, slips
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
@@ -30,7 +30,7 @@ from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.solve.solver import resolved
 from tfeti_dolfinx.subdomains.block import Counters, RigidBlock, SubdomainData, mode_names
-from tfeti_dolfinx.subdomains.factor import added_options
+from tfeti_dolfinx.subdomains.factor import added_options, say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import InverseFactory, regularised
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
@@ -39,7 +39,6 @@ from tfeti_dolfinx.subdomains.subdomains import (
     MakeBlock,
     SubdomainMethod,
     Subdomains,
-    make_subdomains,
     subdomain_data,
 )
 
@@ -88,7 +87,7 @@ class Settings:
         equals: EqualSubdomains | None = None,
         tangents: bool = False,
     ) -> Subdomains:
-        """Return all Blocks of a rank as one. Collective.
+        """Make a Block of each subdomain, whose data is let go then, and one of all. Collective.
 
         ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; ``tools``
         are rigid bodies, of which those with free motions get Blocks. Stiffnesses that ``equals``
@@ -104,21 +103,27 @@ class Settings:
         make = own.block or (lambda item: SparseBlock(item, how, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
-        rigid: list[RigidBlock] = []
+        rigid, count = list[RigidBlock](), len(tools.free_names) if tools else 0
         if tools and own.subdomains is not None:
             raise InputError(
                 f"{tools.free_names[0]}: a rigid body with free motions goes with no other kind of "
                 "Subdomains, as clusters are; expected a motion by a law, or none of them"
             )
-        if tools and tools.num_local:
+        if tools and tools.num_local:  # the last rank has their Blocks
             loads, modes = tools.loads, tools.mode
             rigid = [
                 RigidBlock(tools.bodies[i].name, loads[at], modes[at], tools.law.shape[1])
                 for i, at in tools.unknowns.items()
             ]
-        count = len(tools.free_names) if tools else 0
+        if dofs.comm.rank == 0:
+            say_if_not_cholmod()
+        bodies = decomposition.body_of_subdomain[decomposition.subdomains]
+        bodies = np.append(bodies, decomposition.num_bodies + np.arange(len(rigid)))
+        count += decomposition.num_bodies
         with added_options(self.prefix, self.factor_options):
-            return make_subdomains(data, make, decomposition, counters, choice, kind, rigid, count)
+            with raised_on_all_ranks(dofs.comm):
+                blocks = [make(item) for item in data]
+            return kind([*blocks, *rigid], bodies, count, dofs.comm, counters, choice)
 
     def make_dual(
         self,

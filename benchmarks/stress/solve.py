@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.linalg import qr
@@ -252,14 +253,7 @@ def interior_point(
         if mean < 1e-22:
             break
         H = np.linalg.inv(F + np.diag(s / lam))
-        schur = G @ H @ G.T + 1e-14 * np.eye(r)
-
-        def step(target: np.ndarray) -> tuple[np.ndarray, ...]:
-            right = -dual - s + target / lam  # noqa: B023
-            da = np.linalg.lstsq(schur, -primal - G @ (H @ right), rcond=None)[0]  # noqa: B023
-            dl = H @ (right + G.T @ da)  # noqa: B023
-            return dl, da, target / lam - s - s / lam * dl  # noqa: B023
-
+        step = partial(_newton_step, H, G, (lam, s, dual, primal))
         dl, _, ds = step(np.zeros(m))
         length = min(_longest(lam, dl), _longest(s, ds))
         ahead = (lam + length * dl) @ (s + length * ds) / m
@@ -269,6 +263,17 @@ def interior_point(
             break
         lam, alpha, s = lam + length * dl, alpha + length * da, s + length * ds
     return lam * size / scale, lam > s, U @ (alpha * size / sigma)
+
+
+def _newton_step(
+    H: np.ndarray, G: np.ndarray, now: tuple[np.ndarray, ...], target: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Changes of λ, α and s towards λ_i s_i = target_i, from λ, s and the residuals now."""
+    lam, s, dual, primal = now
+    right, schur = -dual - s + target / lam, G @ H @ G.T + 1e-14 * np.eye(len(G))
+    da = np.linalg.lstsq(schur, -primal - G @ (H @ right), rcond=None)[0]
+    dl = H @ (right + G.T @ da)
+    return dl, da, target / lam - s - s / lam * dl
 
 
 def _longest(x: np.ndarray, dx: np.ndarray) -> float:

@@ -481,9 +481,9 @@ class ClusteredSubdomains(Subdomains):
 
     def inner_motions(self) -> InnerMotions:
         """Rigid motions of the subdomains, those first that are in their kernels."""
-        R, held = super().kernel_rows, self.soft_motions()
-        rows = csr_array(hstack((R, held.rows)))
-        energy = np.concatenate((np.zeros(R.shape[1]), held.energy))
+        R, (held, energy) = super().kernel_rows, self.soft_motions()
+        rows = csr_array(hstack((R, held)))
+        energy = np.concatenate((np.zeros(R.shape[1]), energy))
         sizes = [part.stop - part.start for part in self.trace_parts]
         at = np.repeat(self._clusters.of_subdomain, sizes)
         entries = rows.tocoo()

@@ -96,7 +96,7 @@ class CoarseSpace(Coarse):
         self.null = bcast_from_root(comm, orthonormal_columns(null))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, NullModes(self.null), prefix)
-        self.factor = self.factors.factor(self.grams.whole, "whole")
+        self.factor = self.factors.factor(self.grams.whole, "coarse problem")
         super().__init__(comm, Gt, np.zeros(0), self.factor.solve)
         self.e = self._load()
         self._on_face: Coarse | None = None
@@ -166,7 +166,7 @@ class CoarseSpace(Coarse):
 
         Raise a FactorError where forces on the face do not determine what balances a load.
         """
-        self.factors.count["face"] += int(self.dimension > 0)
+        self.factors.count += int(self.dimension > 0)
         return ObliqueProjectors(self.grams, self.rows, face, C, self.factors.null)
 
     def unresisted(

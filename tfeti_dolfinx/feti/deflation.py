@@ -17,13 +17,13 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, hstack, vstack
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets, summed
+from tfeti_dolfinx.common.parallel import bcast_from_root, joined_over, summed
 from tfeti_dolfinx.feti.coarse import CoarseSpace, transposed_G
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, NullModes
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
-from tfeti_dolfinx.subdomains.subdomains import SoftMotions, Subdomains
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,7 @@ class SoftModes:
         prefix: str = "tfeti_coarse_",
     ) -> None:
         self._comm = coarse.comm
-        own = coarse.subdomains.soft_motions()
-        Gt, energy = _springs(B, coarse, own)
+        Gt, energy = _springs(B, coarse, *coarse.subdomains.soft_motions())
         sigma = mean_stiffness(coarse.subdomains, weights)
         squares = np.bincount(Gt.indices, Gt.data**2, minlength=Gt.shape[1]).astype(float)
         squares = summed(self._comm, squares)
@@ -183,10 +182,11 @@ def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:
     return float(stiffness / max(unknowns, 1.0))
 
 
-def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_array, Array]:
+def _springs(
+    B: PETSc.Mat, coarse: CoarseSpace, rows: csr_array, own: Array
+) -> tuple[csr_array, Array]:
     """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D. Collective."""
-    total = int(chunk_offsets(coarse.comm, own.rows.shape[1])[-1])
-    if total == 0:
-        return csr_array((B.getLocalSize()[0], 0)), np.zeros(0)
-    energy = np.concatenate(coarse.comm.allgather(own.energy))
-    return transposed_G(B, own.rows, total), energy
+    energy = joined_over(coarse.comm, own)
+    if not len(energy):
+        return csr_array((B.getLocalSize()[0], 0)), energy
+    return transposed_G(B, rows, len(energy)), energy

@@ -27,14 +27,7 @@ from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.rigid_bodies import listed
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
-from tfeti_dolfinx.qp.problem import (
-    QP,
-    FaceOperator,
-    LastProduct,
-    Operator,
-    OperatorProduct,
-    operator_product,
-)
+from tfeti_dolfinx.qp.problem import QP, FaceOperator, LastProduct, Operator
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, FeasibleSet, Product, Status
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
@@ -157,7 +150,6 @@ class Dual:
             self.soft = deflation(B, self.coarse, constraints.weights, self.preconditioner, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self.law, self.feasible = feasible, feasible(constraints)
-        self._image: tuple[Array, OperatorProduct] | None = None
         self._norms = dict[int, float]()  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
         self.recycled: Recycled | None = None
@@ -251,9 +243,9 @@ class Dual:
         for operator in (self.F, self.preconditioner):
             if operator is not None:
                 operator.count.clear()
-        self.coarse.factors.count["face"] = 0
+        self.coarse.factors.count = 0
         if self.soft is not None:
-            self.soft.factors.count["face"] = 0
+            self.soft.factors.count = 0
 
     def qp(self, norm_steps: int = 0) -> QP:
         """Return the quadratic program; without kernel it has no coarse problem.
@@ -329,14 +321,6 @@ class Dual:
         made = self._on_faces.on_face(face)
         return made if self.soft is None else self.soft.balanced(face, made)
 
-    def natural_image(self) -> OperatorProduct:
-        """λ̄₀ = Gᵀ(GGᵀ)⁻¹e with F λ̄₀; multiplies once for each e. Collective."""
-        if (found := self.known_image()) is not None:
-            return found
-        made = operator_product(self.F, self.coarse.comm, self.coarse.particular())
-        self._image = (self.coarse.e.copy(), made)
-        return made
-
     @property
     def driving(self) -> Array:
         """The part of d due to load, prescribed values, slips and overlaps; local rows."""
@@ -361,12 +345,6 @@ class Dual:
         self.last.x, self.last.Fx, self.last.within = lam, Fx, 0.0
         lengths = norm_over(comm, known) + norm_over(comm, Fx)
         return lengths > LIMITS.far * norm_over(comm, self.driving)
-
-    def known_image(self) -> OperatorProduct | None:
-        """λ̄₀ and F λ̄₀ if they are known for the present e."""
-        if self._image is None or not np.array_equal(self._image[0], self.coarse.e):
-            return None
-        return self._image[1]
 
     def nearly_free(self, active: Array) -> list[dict[str, object]]:
         """List motions that ``active`` contact rows hold hardly or not, see ``listed``."""

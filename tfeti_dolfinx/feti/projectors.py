@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -274,15 +273,14 @@ class ObliqueProjectors:
 
 @dataclass
 class FaceFactors:
-    """Factors of the Gram matrices of faces; ``count``: how many, of the whole and of faces."""
+    """Factors of the Gram matrices of faces, and how many were made."""
 
     comm: MPI.Intracomm
     null: NullModes
     prefix: str
-    count: Counter[str] = field(default_factory=Counter)
+    count: int = 0
 
-    def factor(self, gram: csr_array, kind: str = "face") -> SemidefiniteFactor:
+    def factor(self, gram: csr_array, of: str = "active set") -> SemidefiniteFactor:
         """Return a factor of a Gram matrix, or raise a FactorError. Collective."""
-        self.count[kind] += int(gram.shape[0] > 0)
-        what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'active set'}"
-        return SemidefiniteFactor(gram, self.null, self.comm, what, self.prefix)
+        self.count += int(gram.shape[0] > 0)
+        return SemidefiniteFactor(gram, self.null, self.comm, f"GGᵀ of the {of}", self.prefix)

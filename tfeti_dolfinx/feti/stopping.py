@@ -232,8 +232,6 @@ class Accuracy(StoppingRule):
         self.looks, self._stalls, self._claimed = 0, 0, 1.0
         self.recovered: Recovered | None = None
         self._before: Measures | None = None
-        # of a look, and an estimate of ‖F‖
-        self._allowed: tuple[int, float, Tolerances] | None = None
         # of a look with other multipliers: the first one's errors
         self._least: Array = np.zeros(1)
         self.goal: ErrorTarget | None = None
@@ -333,8 +331,6 @@ class Accuracy(StoppingRule):
     def tolerances(self) -> Tolerances:
         """Return the tolerances that the last assessment is compared with."""
         now, given = self.measures, self._limits
-        if self._allowed is not None and self._allowed[:2] == (self.looks, self.norm):
-            return self._allowed[2]
         at_rest = self._at_rest()
         most = now.size.max(initial=0.0)
         # a body that is stiff beside another has the error of the other's forces on top
@@ -348,14 +344,12 @@ class Accuracy(StoppingRule):
         # rounding of bodies that do not deform at all: its energy, and forces that make it
         rigid = float(np.sqrt(now.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
         balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self.norm)
-        found = Tolerances(
+        return Tolerances(
             displacement=displacement,
             jump=2.0 * largest,
             balance=balance + all_rest * now.stiffness.max(initial=0.0),
             energy=given.energy * self.rtol * now.energy + rigid,
         )
-        self._allowed = self.looks, self.norm, found
-        return found
 
     def ratio(self, changes: bool = True) -> float:
         """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""

@@ -77,10 +77,6 @@ class Freezable:
         self._constants = extract_constants(expression)
         self._functions = [f for f in extract_coefficients(expression) if f is not u]
 
-    def __call__(self, u: fem.Function) -> Any:
-        """Return the expression with another function."""
-        return ufl.replace(self.expression, {self._u: u})
-
     def frozen(self) -> Callable[..., Any]:
         """Return what makes the expression, of any function, with what else is in it as it is now.
 

@@ -25,7 +25,6 @@ from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonToleran
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue, check_state
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.report import COUNTERS, Report, added
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
 from tfeti_dolfinx.solution import Solution
 
@@ -71,6 +70,9 @@ class NonlinearContactProblem(ContactProblem):
             ``decomposition.mesh`` is where it was.
         tolerances: Those of Newton's method.
         others: As for ``ContactProblem``; ``rtol`` is that of the displacement.
+
+    ``solve`` goes on from the last displacement. Where Newton's method or a linearised problem does
+    not converge it raises a ConvergenceError, and ``u`` is where the load step began.
 
     Raises:
         InputError: Something given does not fit; the message names it.
@@ -127,7 +129,7 @@ class NonlinearContactProblem(ContactProblem):
             raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact, self._atol = self.options.number, self.options.atol
         self._system.follows = True
-        self._first = self._begin = np.array(u.x.array)
+        self._begin = self._first
         length = bcast_from_root(decomposition.comm, diameter(decomposition))
         self._least = self._tolerances.nowhere * length if finite else 0.0
         # of where bodies are
@@ -150,23 +152,10 @@ class NonlinearContactProblem(ContactProblem):
         assert isinstance(forms, NewtonForms)
         return forms
 
-    def solve(self) -> fem.Function:
-        """Solve the load step from the last displacement on.
-
-        Returns:
-            The displacement, on the torn mesh.
-
-        Raises:
-            InputError: As ``ContactProblem.solve``.
-            NoSolutionError: A linearised problem has no solution.
-            ConvergenceError: Newton's method, or a linearised problem, did not converge. ``u`` is
-                where the load step began.
-            FactorError: A tangent stiffness could not be factored.
-        """
-        self._meet("solve")
-        begin, total = np.array(self.u.x.array), Totals()
+    def _find(self) -> None:
+        begin = np.array(self.u.x.array)
         try:
-            self._newton(total)
+            self._newton()
             # loads that go on find the tangent of the last step nearer than an elastic one
             self._newton_forms.kept = not self._finite
         except TfetiError:  # on all ranks
@@ -177,10 +166,8 @@ class NonlinearContactProblem(ContactProblem):
         finally:
             warns = self._settings.options.warnings
             self.options = replace(self.options, rtol=self._exact, atol=self._atol, warnings=warns)
-            self.report.take(total.entered(self.report))
-        return self.u
 
-    def _newton(self, total: Totals) -> None:
+    def _newton(self) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
         forms, asked = self._newton_forms, self._last_increment
         faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
@@ -199,7 +186,7 @@ class NonlinearContactProblem(ContactProblem):
                 raise ConvergenceError(
                     f"Newton's method: after {step} steps {error}; or smaller load steps"
                 ) from error
-            total.add(self.report)
+            self._counts.newton_steps += 1
             end = np.array(self.u.x.array)
             d = end - u
             size = largest(comm, d)
@@ -283,7 +270,8 @@ class NonlinearContactProblem(ContactProblem):
         if self._places is not None:
             self._go_to_places(self._places)
         try:
-            self._solve()
+            self._system.look_for_changes()
+            self._solve_in_rounds()
         finally:
             self._newton_forms.known = None
             if self._places is not None:
@@ -456,8 +444,6 @@ class NonlinearContactProblem(ContactProblem):
 
     def _return(self) -> None:
         super()._return()
-        if self._solution is None:
-            self.u.x.array[:] = self._first
         self._set(self.u.x.array)
 
 
@@ -468,22 +454,3 @@ def check_gaps(contacts: Sequence[ContactPartner]) -> None:
             raise InputError(
                 f'{contact.name}: a given gap with finite=True; expected gap="geometry" or "curved"'
             )
-
-
-class Totals:
-    """Counters and seconds of the linearised problems of a load step, for its report."""
-
-    def __init__(self) -> None:
-        self._sums: dict[str, Any] = dict.fromkeys(COUNTERS, 0)
-        self._seconds: dict[str, float] = {}
-        self.steps = 0
-
-    def add(self, report: Report) -> None:
-        """Add those of a linearised problem."""
-        self.steps += 1
-        self._sums = added(self._sums, report.counters)
-        self._seconds = added(self._seconds, report.seconds)
-
-    def entered(self, report: Report) -> Report:
-        """Return the report of the load step."""
-        return replace(report, **self._sums, seconds=self._seconds, newton_steps=self.steps)

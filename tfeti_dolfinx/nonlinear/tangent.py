@@ -7,34 +7,8 @@ from typing import Any
 import ufl
 from dolfinx import fem
 from ufl.algorithms import expand_derivatives
-from ufl.algorithms.map_integrands import map_integrand_dags
 from ufl.constantvalue import Zero
-from ufl.corealg.multifunction import MultiFunction
 from ufl.corealg.traversal import unique_pre_traversal
-
-from tfeti_dolfinx.errors import InputError
-
-
-class GradientReplaced(MultiFunction):  # type: ignore[misc]
-    """Replace ∇v in a residual by a tensor, and v itself, as body forces have it, by 0."""
-
-    def __init__(self, v: Any, gradient: Any) -> None:
-        super().__init__()
-        self._v, self._gradient = v, expand_derivatives(gradient)
-
-    expr = MultiFunction.reuse_if_untouched
-
-    def grad(self, o: Any) -> Any:
-        """Map ∇v; other gradients stay."""
-        if o.ufl_operands[0] == self._v:
-            return self._gradient
-        if self._v in set(unique_pre_traversal(o)):
-            raise InputError("F: second derivatives of the test function; expected first ones")
-        return o
-
-    def argument(self, o: Any) -> Any:
-        """Map v to 0."""
-        return Zero(o.ufl_shape) if o == self._v else o
 
 
 def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
@@ -70,9 +44,11 @@ def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
     def moved(of_w: Any, of_v: Any) -> Any:
         return (of_w * inverse).T * of_v
 
-    # F is linear in ∇v: the difference of both geometric parts is that of one gradient
+    # F is linear in ∇v: the difference of both geometric parts is that of one gradient; v itself,
+    # as body forces have it, has none
     gradient = moved(stretched(w), stretched(v)) - moved(ufl.grad(w), ufl.grad(v))
-    return tangent + map_integrand_dags(GradientReplaced(v, gradient), inside)
+    change = {ufl.grad(v): expand_derivatives(gradient), v: Zero(v.ufl_shape)}
+    return tangent + ufl.replace(inside, change)
 
 
 def _has_gradient_of(expression: Any, u: fem.Function) -> bool:

@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.recycling import DirectionStore, RecycledOnFace
+from tfeti_dolfinx.qp.recycling import Along, DirectionStore
 
 # --- Estimate of ‖PFP‖ ------------------------------------------------------------------------
 
@@ -205,8 +205,8 @@ def pcpg(
             z, rz, _, products = qp.coarse.project_against(z, r, kept.images @ z)
         # direction
         p = z - products @ kept.directions
-        if past is not None:
-            p = p - past.along(p, past.known.images)[0]
+        if past is not None and recycled is not None:
+            p = p - past(p, recycled.images)[0]
         # step
         Fp = qp.F(p)
         PFp, pFp, pp, (rp,) = qp.coarse.project_against(Fp, p, np.array([r @ p]))
@@ -287,20 +287,16 @@ def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> Converge
     return rule.examine(point.lam, point.g, face, norm)
 
 
-def _begun(qp: QP, point: Point, own: Directions) -> tuple[RecycledOnFace | None, float]:
-    """Minimise q over directions of earlier solves; return these, if any, and ‖r‖, r = −P g.
+def _begun(qp: QP, point: Point, own: Directions) -> tuple[Along | None, float]:
+    """Minimise q over directions of earlier solves; return steps along them, and ‖r‖, r = −P g.
 
     Projected twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
     """
     project, past = qp.coarse.project, None
     own.r = project(project(-point.g))
-    if qp.recycled is not None and qp.recycled.count > 0:
-        past = RecycledOnFace(qp.recycled, qp.held)
-        if past.count == 0:
-            past = None
-        else:
-            way, b = past.along(own.r, past.known.directions)
-            # rounding of many directions is none of Gλ = e
-            point.lam, point.g = point.lam + project(way), point.g + past.known.images.T @ b
-            own.fresh, own.r = True, project(project(-point.g))
+    if qp.recycled is not None and (past := qp.recycled.on_face(qp.held)) is not None:
+        way, b = past(own.r, qp.recycled.directions)
+        # rounding of many directions is none of Gλ = e
+        point.lam, point.g = point.lam + project(way), point.g + qp.recycled.images.T @ b
+        own.fresh, own.r = True, project(project(-point.g))
     return past, norm_over(qp.coarse.comm, own.r)

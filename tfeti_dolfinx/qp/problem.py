@@ -221,15 +221,13 @@ class Homogenised:
     lam_bar: Array  # λ̄
     gradient: Array  # F λ̄ − d
     b: Array  # P(d − F λ̄)
-    # size of the residual at λ̄₀ = Gᵀ(GGᵀ)⁻¹e, b₀ = ‖P(d − F λ̄₀)‖, whatever λ̄ is
-    reference: float
+    reference: float  # size of residuals, b₀
     rounding: float  # what rounding leaves of b₀ where it should be 0
 
 
 def homogenise(
     qp: QP,
     at: OperatorProduct | None = None,
-    natural: OperatorProduct | None = None,
     warm: bool = False,
 ) -> Homogenised:
     """Homogenise a quadratic program. Collective.
@@ -238,28 +236,24 @@ def homogenise(
         qp: The program.
         at: A solution of Gλ̄ = e with its image; default λ̄₀, which costs one multiplication by F if
             e ≠ 0.
-        natural: Where the size of residuals is taken: λ̄₀ with its image; default λ̄.
-        warm: Without it: λ̄ may be the solution. ‖P d‖ and ‖P F λ‖ are equal there, and b₀ is ‖P d‖
+        warm: Whether λ̄ may be the solution. ‖P d‖ and ‖P F λ‖ are equal there, and b₀ is ‖P d‖
             where e = 0: the larger one is taken.
     """
     project, norm = qp.coarse.project, partial(norm_over, qp.coarse.comm)
     at = at or operator_product(qp.F, qp.coarse.comm, qp.coarse.particular())
     # 1. b; d on rows that are open without forces: P would spread it over all others
     gradient = at.Fx - qp.d
+    residual = project(gradient)
     phi, beta = qp.feasible.split(qp.feasible.project(np.zeros(len(qp.d))), -qp.d)
     gaps = np.where((phi == 0.0) & (beta == 0.0), qp.d, 0.0)
     b = project(-gradient - gaps)
-    b = b + gaps if norm(b) <= FAR_OPEN * norm(gaps) else project(-gradient)
+    b = b + gaps if norm(b) <= FAR_OPEN * norm(gaps) else -residual
     # 2. the size of residuals, and its rounding, to which open gaps, however wide, do not count
-    sized = natural or at
-    residual = project(sized.Fx - qp.d)
-    size = norm(residual)
-    if warm and natural is None:
-        size = max(norm(project(qp.d)), norm(project(at.Fx)))
-    phi, beta = qp.feasible.split(qp.feasible.project(sized.x), residual)
+    size = max(norm(project(qp.d)), norm(project(at.Fx))) if warm else norm(residual)
+    phi, beta = qp.feasible.split(qp.feasible.project(at.x), residual)
     # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
     counts = (phi != 0.0) | ((beta != 0.0) & (qp.d > 0.0))
-    rounding = ROUNDING * sum(norm(np.where(counts, x, 0.0)) for x in (qp.d, sized.Fx))
+    rounding = ROUNDING * sum(norm(np.where(counts, x, 0.0)) for x in (qp.d, at.Fx))
     return Homogenised(at.x, gradient, b, size, rounding)
 
 

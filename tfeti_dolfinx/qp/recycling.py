@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,9 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, dot_over, summed
+
+# from a vector, and directions or images as rows, to a step and its coefficients
+Along = Callable[[Array, Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -128,40 +132,30 @@ class Recycled(DirectionStore):
         longest = float(np.sqrt(bcast_from_root(self.comm, float(squares.max(initial=0.0)))))
         return np.asarray(Vt[int(np.sum(sizes > self.parameters.held * longest)) :].T)
 
-    def on_face(self, held: Array) -> Array:
-        """Return ``without`` of their values on flagged rows, kept while both stay. Collective."""
-        changes, known, _ = self._on_face
-        same = changes == self.changes and np.array_equal(known, held)
-        if any_rank(self.comm, not same):
-            self._on_face = self.changes, held, self.without(self.directions.T[held])
-        return self._on_face[2]
+    def on_face(self, held: Array | None) -> Along | None:
+        """Return steps along directions that are 0 on flagged rows; None without any. Collective.
 
-
-class RecycledOnFace:
-    """Directions of earlier solves that lie in a face. Creation and all methods are collective.
-
-    ``held`` are flags of the local rows that are 0 on the face; None: no rows. ``known`` must stay
-    as it is meanwhile; ``count`` is the number of directions.
-    """
-
-    def __init__(self, known: Recycled, held: Array | None = None) -> None:
-        self.known, self._held = known, held
-        self._N = None if held is None else known.on_face(held)
-        self.count = known.count if self._N is None else self._N.shape[1]
-
-    def along(self, x: Array, rows: Array) -> tuple[Array, Array]:
-        """Return W b, 0 where the face holds rows, and b = N Nᵀ rows x; one reduction.
-
-        For r = −P(Fλ − d) and the directions W as rows that is the step to where q is least; p less
-        that for p and the images FW is F-orthogonal to W.
+        Of x and rows it gives W b and b = N Nᵀ rows x, by one reduction. For r = −P(Fλ − d) and the
+        directions W as rows that is the step to where q is least; p less that for p and the images
+        FW is F-orthogonal to W. They must stay as they are meanwhile.
         """
-        b = summed(self.known.comm, rows @ x)
-        if self._N is not None:
-            b = self._N @ (self._N.T @ b)
-        step = self.known.directions.T @ b
-        if self._held is not None:
-            step[self._held] = 0.0
-        return step, b
+        N: Array | None = None
+        if held is not None and self.count:
+            changes, known, N = self._on_face
+            same = changes == self.changes and np.array_equal(known, held)
+            if any_rank(self.comm, not same):
+                N = self.without(self.directions.T[held])
+                self._on_face = self.changes, held, N
+
+        def along(x: Array, rows: Array) -> tuple[Array, Array]:
+            b = summed(self.comm, rows @ x)
+            b = b if N is None else N @ (N.T @ b)
+            step = self.directions.T @ b
+            if held is not None:
+                step[held] = 0.0
+            return step, b
+
+        return along if (self.count if N is None else N.shape[1]) else None
 
 
 def triangle(comm: MPI.Intracomm, A: Array) -> Array:

@@ -91,10 +91,9 @@ def solve_dual(
 ) -> tuple[QPResult, Accuracy]:
     """Solve the dual problem, and look at the answer. Collective.
 
-    From the solution of an earlier solve PCPG multiplies by F once, SMALSE-M at most twice: once
-    less each if F λ̄ is known, as it is where the dual problem has been solved for the same e, or
-    where there is no kernel and it starts where the last solve has ended. Block Newton multiplies
-    once, and not even that where it starts at the end of the last solve.
+    From the solution of an earlier solve PCPG multiplies by F once, SMALSE-M at most twice: PCPG
+    not even that where there is no kernel and it starts where the last solve has ended. Block
+    Newton multiplies once, and not even that where it starts at the end of the last solve.
 
     Args:
         dual: The dual problem.
@@ -152,7 +151,7 @@ def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
 
 
 def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:
-    """Homogenise with λ̄ at the solver's start, or λ̄₀, whose image is kept."""
+    """Homogenise with λ̄ at the solver's start, or λ̄₀."""
     if start is not None and solver.warm is not None:
         at = dual.last.image(qp.F, qp.coarse.comm, solver.warm(qp, start))
         # Begin at 0 where it is admissible and q is no less at a start, as after unloading: of what
@@ -164,10 +163,9 @@ def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homo
             at = OperatorProduct(zero, zero)
             if start.mu is not None:
                 start.mu[:] = 0.0
-        return homogenise(qp, at, dual.known_image(), warm=True)
-    if solver.cold is not None:
-        return homogenise(qp, operator_product(qp.F, qp.coarse.comm, solver.cold(qp)))
-    return homogenise(qp, dual.natural_image())
+        return homogenise(qp, at, warm=True)
+    cold = qp.coarse.particular() if solver.cold is None else solver.cold(qp)
+    return homogenise(qp, operator_product(qp.F, qp.coarse.comm, cold))
 
 
 def conclude(

@@ -263,7 +263,6 @@ class ContactDynamics(ContactProblem):
         check_copies(self.u.x.array, self.dofs, "u, the displacement at the begin,")
         check_copies(v, self.dofs, "velocity")
         self._forms_in_time.inertia.move(np.array(self.u.x.array), np.array(v))
-        self._first = np.array(self.u.x.array)
         self._predictor: Predictor | None = None
         if self._stabilised:
             self._predictor = Predictor(self.dofs, self._settings)
@@ -328,11 +327,6 @@ class ContactDynamics(ContactProblem):
             return
         assert self.solution.v is not None
         self._forms_in_time.inertia.move(np.array(self.u.x.array), self.solution.v)
-
-    def _return(self) -> None:
-        super()._return()
-        if self._solution is None:
-            self.u.x.array[:] = self._first
 
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
@@ -463,24 +457,18 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         assert isinstance(forms, InertialNewtonForms)
         return forms
 
-    def solve(self) -> fem.Function:
-        """Solve for the end of the step; see ``NonlinearContactProblem.solve``.
-
-        Raises:
-            InputError: As there, or the step has no size yet.
-        """
-        self._meet("solve")
+    def _find(self) -> None:
         if self._places is not None:
             self._go_to_places(self._places)
         try:
             self._system.look_for_changes()
-            super()._set_out()
+            self._set_out()
             if self._places is not None and self._newton_forms.inertia.motion.size:
                 self._project_velocity()
         finally:
             if self._places is not None:
                 self._places.back()
-        return super().solve()
+        super()._find()
 
     def _project_velocity(self) -> None:
         """Start the step with the velocity that goes to the prediction.
@@ -497,9 +485,6 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         w = self.dofs.to_primal(motion.towards)
         struck = ContactProblem._make_solution(self, w, forces, self._system.gluing)
         self._blows = [struck.contact(i).resultant.force for i in range(len(self.contacts))]
-
-    def _set_out(self) -> None:
-        """Do nothing: linearised problems share the prediction of their step."""
 
     def _look(self) -> None:
         self._newton_forms.inertia.ends = self._newton_forms.forces()

@@ -22,7 +22,6 @@ class Counters:
     """Counters of a rank's Blocks."""
 
     factorizations: int = 0  # factorisations
-    load_solves: int = 0  # solves for K⁺f, one for each Block and load
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -24,7 +24,6 @@ from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind, RigidBlock, SubdomainData
-from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
@@ -47,14 +46,6 @@ class RoundingTolerances:
 
 
 TOLERANCES = RoundingTolerances()
-
-
-@dataclass(frozen=True)
-class SoftMotions:
-    """Motions R̂ of a rank that have a diagonal R̂ᵀKR̂ = D."""
-
-    rows: csr_array  # R̂ on the trace, scipy CSR, shape (t, k)
-    energy: Array  # D, shape (k,)
 
 
 def _outside_motions(block: Block) -> tuple[Array, Array]:
@@ -186,15 +177,18 @@ class Subdomains:
         pairs = zip(self.blocks, self.kernel_parts, strict=True)
         return joined([block.kernel @ alpha[part] for block, part in pairs])
 
-    def soft_motions(self) -> SoftMotions:
-        """Return the motions of each Block that springs hold: rigid ones that are no kernel."""
+    def soft_motions(self) -> tuple[csr_array, Array]:
+        """Return the motions R̂ of Blocks that springs hold: rigid ones that are no kernel.
+
+        On the trace, shape ``(t, k)``, with the diagonal matrix R̂ᵀKR̂, shape ``(k,)``.
+        """
         found = [_outside_motions(block) for block in self.blocks]
         pairs = list(zip(self.blocks, found, strict=True))
         trace = [R[block.trace_dofs] for block, (R, _) in pairs]
         begins = np.cumsum([0, *(part.shape[1] for part in trace)])
         rows = [part.start for part in self.trace_parts]
         of_trace = _assembled(trace, rows, list(begins[:-1]), (len(self.trace), int(begins[-1])))
-        return SoftMotions(of_trace, joined([D for _, D in found]))
+        return of_trace, joined([D for _, D in found])
 
     # ------------------------------------------------------- rigid bodies' unknowns
 
@@ -273,7 +267,6 @@ class Subdomains:
     def pinv_load(self) -> Array:
         """K⁺ f on all unknowns, shape ``(n,)``; solved for once."""
         if self._pinv_load is None:
-            self.counters.load_solves += len(self.blocks)
             load = joined([block.load for block in self.blocks])
             self._pinv_load = self.solve(load)
         return self._pinv_load
@@ -409,32 +402,6 @@ def subdomain_data(
         )
 
     return map(data_of, range(len(dofs.subdomains)))
-
-
-def make_subdomains(
-    data: Iterable[SubdomainData],
-    make_block: MakeBlock,
-    decomposition: Decomposition,
-    counters: Counters | None = None,
-    choice: LocalChoice | None = None,
-    kind: Callable[..., Subdomains] = Subdomains,
-    rigid: Sequence[RigidBlock] = (),
-    num_rigid: int = 0,
-) -> Subdomains:
-    """Make a Block of each subdomain of this rank, whose data is let go then. Collective.
-
-    What ``make_block`` raises, say a class of one's own, is raised on all ranks. Of ``num_rigid``
-    rigid bodies the last rank has the Blocks.
-    """
-    comm = decomposition.comm
-    if comm.rank == 0:
-        say_if_not_cholmod()
-    with raised_on_all_ranks(comm):
-        blocks = [make_block(item) for item in data]
-    count = decomposition.num_bodies
-    bodies = decomposition.body_of_subdomain[decomposition.subdomains]
-    bodies = np.append(bodies, count + np.arange(len(rigid)))
-    return kind([*blocks, *rigid], bodies, count + num_rigid, comm, counters, choice)
 
 
 def subdomain_stiffness(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
