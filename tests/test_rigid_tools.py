@@ -409,24 +409,28 @@ def test_a_tool_that_no_nonlinear_body_balances_is_named(finite):
         nonlinear(finite, tool).solve()
 
 
+@pytest.mark.parametrize("finite", [False, True])
 @pytest.mark.parametrize("weight", [0.0, 0.01])
 @pytest.mark.parametrize("reach", [None, 5.0])
-def test_a_body_that_was_pushed_stays_when_the_tool_goes_back(reach, weight):
-    """Nothing holds it or drives it: its motion counts from where it is, on rollers."""
+def test_a_body_that_was_pushed_stays_when_tools_go_back(reach, weight, finite):
+    """Nothing else drives it: its motion counts from where it is, beside what another tool does."""
     decomposition = decomposed("triangle", 6, 4)
     V, _, v = vectors(decomposition)
     u = fem.Function(V)
-    energy = neo_hooke(u, 1.0, 0.3) + fem.Constant(decomposition.mesh, weight) * u[1]
-    law = lambda t: (np.interp(t, [0, 1, 2], [0, 1, 0]), 0.0)  # noqa: E731
-    plane = tfeti.Plane((0, 0), normal=(1, 0))
-    plate = tfeti.Obstacle("left", plane, displacement=law, reach=reach)
-    given = held(decomposition, "bottom")(V), [plate], decomposition
+    law = neo_hooke(u, 1.0, 0.3) if finite else 0.5 * ufl.inner(hooke()(u), strain(u))
+    energy = law + fem.Constant(decomposition.mesh, weight) * u[1]
+    ways = [fem.Constant(decomposition.mesh, (0.0, 0.0)) for _ in range(2)]
+    tools = [
+        tfeti.Obstacle(side, tfeti.Plane((0, 0), normal), displacement=way, reach=reach)
+        for side, normal, way in zip(("left", "bottom"), np.eye(2), ways, strict=True)
+    ]
     F = ufl.derivative(energy * ufl.dx, u, v)
-    problem = tfeti.NonlinearContactProblem(F, u, *given, finite=True)
-    for problem.time in (0.5, 1.0, 1.2, 2.0):
+    problem = tfeti.NonlinearContactProblem(F, u, [], tools, decomposition, finite=finite)
+    for right, up, x, y in ((0.5, 0, 0.5, 0), (1, 0, 1, 0), (0.8, 0.2, 1, 0.2), (0, 0, 1, 0.2)):
+        ways[0].value[0], ways[1].value[1] = right, up
         problem.solve()
         problem.accept()
-        assert np.allclose(u.x.array.reshape(-1, 2), (min(problem.time, 1.0), 0.0), atol=0.02)
+        assert np.allclose(u.x.array.reshape(-1, 2), (x, up if weight else y), atol=0.02)
 
 
 @pytest.mark.parametrize("kind", ["linear", "nonlinear"])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, least, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, least, summed
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.rigid_bodies import orthonormal_columns
@@ -81,25 +81,33 @@ def recover(
 def nearest(coarse: CoarseSpace, state: Recovered, rest: Array, nothing: float = 1e-10) -> Array:
     """Return of displacements that are as right as one the nearest to another. Collective.
 
-    Motions that no active row holds go as far as the gaps of the other rows allow.
+    Motions that no active row holds go as far as the gaps of the other rows allow; what a row then
+    stops holds, and the others go on.
 
     Args:
         coarse: The coarse space.
         state: The displacement, with its gaps and active rows.
         rest: The other one, shape ``(n,)``.
-        nothing: Share of the largest change of a gap that is rounding.
+        nothing: Share of the largest motion of a body: a gap that changes by less does not change.
     """
-    N = orthonormal_columns(coarse.unresisted(state.active).columns)
-    if not (N := bcast_from_root(coarse.comm, N)).shape[1]:
-        return state.u
-    alpha = coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(rest - state.u)))
-    closing = coarse.Gt @ alpha
-    rows = coarse.bounded
-    rounding = nothing * largest(coarse.comm, closing[rows])
-    rows = rows[(closing[rows] > rounding) & ~state.active[rows]]
-    allowed = np.maximum(state.gap[rows], 0.0) / closing[rows]
-    share = least(coarse.comm, float(allowed.min(initial=1.0)))
-    return np.asarray(state.u + share * coarse.kernel_motion(alpha))
+    u, gap, held, rows, left = state.u, state.gap, state.active, coarse.bounded, np.inf
+    while True:
+        N = bcast_from_root(coarse.comm, orthonormal_columns(coarse.unresisted(held).columns))
+        if not 0 < N.shape[1] < left:
+            return u
+        left = N.shape[1]
+        motion = N @ (N.T @ coarse.bodies.part_of(rest - u))
+        alpha = coarse.motions @ motion
+        closing = coarse.Gt @ alpha
+        closes = closing > nothing * np.abs(motion).max() * coarse.row_size
+        at = rows[(closes & ~held)[rows]]
+        allowed = np.maximum(gap[at], 0.0) / closing[at]
+        share = least(coarse.comm, float(allowed.min(initial=1.0)))
+        u, gap = u + share * coarse.kernel_motion(alpha), gap - share * closing
+        held = np.array(held)
+        held[at[allowed <= share]] = share < 1.0
+        if share == 1.0:
+            return u
 
 
 def elastic_displacement(
