@@ -152,8 +152,7 @@ def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
     load = np.array([0.01] * (scene.gdim - 1) + [-0.05])
 
     def solve(factor):
-        on_traction, on_value = LOADS[kind]
-        return scene.solve(factor * on_traction * load, factor * on_value * load)
+        return scene.solve(*(factor * share * load for share in LOADS[kind]))
 
     first = solve(1.0)
     for factor in (0.0, 1.0, -1.0, 0.0):
@@ -183,8 +182,7 @@ def check_small_loads(solve, rtol, factors):
 @pytest.mark.parametrize("first", [1e-3, 1.0])
 def test_a_gap_that_stays_open_does_not_limit_what_a_small_load_is_solved_to(qp_type, rtol, first):
     scene, load = Scene("triangle", gap=0.01, qp_type=qp_type, rtol=rtol), np.array([0.01, -0.05])
-    factors = (first, 1e-3, 1e-12, 1e-14)
-    check_small_loads(lambda factor: scene.solve(factor * load), rtol, factors)
+    check_small_loads(lambda factor: scene.solve(factor * load), rtol, (first, 1e-3, 1e-12, 1e-14))
     scene.problem.destroy()
 
 
@@ -201,7 +199,7 @@ def test_a_body_that_is_lifted_as_a_whole_has_no_forces():
     [("triangle", 0.0, None), ("tetrahedron", 1 / 3, tfeti.Coulomb(0.3))],
 )
 def test_a_body_brought_to_another_only_touches_it(cell, gap, friction):
-    """Forces are rounding, for which nothing is solved: at first, and back from a pressure."""
+    """Forces are rounding, for which nothing is solved; what presses them knows of no ‖F‖ yet."""
     d = stacked(cell, 3, 4, 4 if friction is None else 2, upper=(0.1, 0.9), gap=gap)
     value = fem.Constant(d.mesh, np.zeros(d.mesh.geometry.dim))
     V, u, v = vectors(d)
@@ -215,8 +213,8 @@ def test_a_body_brought_to_another_only_touches_it(cell, gap, friction):
     for pressed in (0.0, 0.01, 0.0):
         value.value[0], value.value[-1] = 0.01 * (friction is None), -gap - pressed
         problem.solve()
+        assert problem.report.F_multiplications <= (20 if pressed else 2)
         if not pressed:
-            assert problem.report.F_multiplications <= 2
             assert problem.solution.contact().resultant.force == pytest.approx(0, abs=1e-12)
     problem.destroy()
 
@@ -261,8 +259,7 @@ def test_a_body_at_rest_behind_an_open_gap_does_not_limit_that_either(friction, 
 
 
 def test_a_body_that_contact_alone_holds_comes_to_rest():
-    gap = 0.01
-    d = decomposed("triangle", 6, 3)
+    gap, d = 0.01, decomposed("triangle", 6, 3)
     load = fem.Constant(d.mesh, np.zeros(2))
     plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), gap=gap, reach=0.5)
     problem = two_body_problem(d, drawn(d, "top", load), held(d, "left"), [plane])
@@ -271,8 +268,7 @@ def test_a_body_that_contact_alone_holds_comes_to_rest():
         problem.solve()
         down = displacement(problem)[1][:, 1]
         # ε of plane strain under a pressure: (1 + ν)(1 − 2ν)/(1 − ν)/E would be held at both sides
-        strain = pressed * (1 - 0.3**2)
-        expected = -strain - (gap if pressed else 0.0)
+        expected = -pressed * (1 - 0.3**2) - (gap if pressed else 0.0)
         assert down.min() == pytest.approx(expected, rel=1e-5, abs=1e-18)
     problem.destroy()
 

@@ -558,7 +558,7 @@ def newton(
         projected_gradient=state.residual,
         equality=qp.coarse.norm_Q(state.z.lam - homogenised.lam_bar),
         reference=homogenised.reference,
-        norm=state.norm,
+        norm=solver.directions.norm,
         steps=steps,
         excluding=none if solver.excluding is None else solver.excluding,
     )

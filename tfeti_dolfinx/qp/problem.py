@@ -133,7 +133,7 @@ class QPResult:
     projected_gradient: float  # ‖g^P‖ at the end
     equality: float  # ‖Q x‖ at the end, x the homogenised unknown
     reference: float  # b₀ = ‖P(d − F λ̄₀)‖
-    norm: float  # estimate of ‖F‖ that ‖Q x‖ is weighted with
+    norm: float  # estimate of ‖F‖ that ‖Q x‖ is weighted with; 0 where nothing has shown it
     steps: Steps = field(default_factory=Steps)  # steps taken
     # local rows that exclude each other, if that is why the solver stopped
     excluding: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
