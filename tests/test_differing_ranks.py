@@ -177,19 +177,17 @@ def a_field_on_one(s, folder):
     (s.d.to_original if ODD else s.d.locate_facets)(problem.u if ODD else of_side)
 
 
-def tolerances_on_one(s, folder):
-    u, held = fem.Function(s.V), [s.held()]
-    F = ufl.action(s.a, u) - s.load()
-    steps = tfeti.NewtonTolerances(max_it=9 if ODD else 8)
-    tfeti.NonlinearContactProblem(F, u, held, [floor()], s.d, tolerances=steps).solve()
+def nonlinear(**given):
+    def do(s, folder):
+        u, held = fem.Function(s.V), [s.held()]
+        F = ufl.action(s.a, u) - s.load()
+        tfeti.NonlinearContactProblem(F, u, held, [floor()], s.d, **given).solve()
+
+    return do
 
 
 def of_side(x):
     return x[0] < 0.1
-
-
-def moved(t):
-    return (0.0, 0.02 if ODD else 0.01)
 
 
 COULOMB = tfeti.Coulomb(0.3)
@@ -277,11 +275,12 @@ CASES = {
         r"rank \d has called to_original where rank 0 has called locate_facets",
     ),
     "tolerances of Newton's method on one": (
-        tolerances_on_one,
+        nonlinear(tolerances=tfeti.NewtonTolerances(max_it=9 if ODD else 8)),
         rf"tolerances: max_it is 9{ON}8 on rank 0",
     ),
+    "an update that raises on one": (nonlinear(update=lambda: 1 / (not ODD)), "update: ZeroDiv"),
     "a law of another value on one": (
-        contacts(*[[floor(displacement=moved)]] * 2),
+        contacts(*[[floor(displacement=lambda t: (0.0, 0.02 if ODD else 0.01))]] * 2),
         rf"motion and load\[0\]\[1\] is 0.02{ON}0.01 on rank 0",
     ),
     "stabilised on one": (thrown(stabilised=(False, True)), rf"stabilised is True{ON}False"),

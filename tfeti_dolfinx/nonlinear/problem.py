@@ -13,11 +13,17 @@ from dolfinx import fem
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, largest, summed
-from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type
+from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
-from tfeti_dolfinx.errors import ConvergenceError, InputError, OverlapError, TfetiError
+from tfeti_dolfinx.errors import (
+    ConvergenceError,
+    InputError,
+    OverlapError,
+    TfetiError,
+    raised_on_all_ranks,
+)
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
@@ -289,7 +295,8 @@ class NonlinearContactProblem(ContactProblem):
         """Take a displacement, and what depends on it. Collective."""
         self.u.x.array[:], self._newton_forms.known = u, None
         if self._update is not None:
-            self._update()
+            with raised_on_all_ranks(self.decomposition.comm), named("update"):
+                self._update()
 
     def _smallest_volume(self) -> float:
         """Return the smallest det F; 1 in small strain. Collective."""
