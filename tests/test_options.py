@@ -32,24 +32,6 @@ def test_the_command_line_beats_the_dictionary():
     assert parse_options({"tfeti_rtol": 1e-9}, "tfeti_").rtol == 1e-9
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"tfeti_rtol": -1}, r"-tfeti_rtol -1.0: expected 0 or more"),
-        ({"tfeti_monitor": "maybe"}, r"-tfeti_monitor 'maybe': expected a value of type bool"),
-        ({"tfeti_smalse_beta": 1.0}, r"-tfeti_smalse_beta 1.0: expected between 0 and 1"),
-        (
-            {"tfeti_without": "d_scaling,care"},
-            r"-tfeti_without care: expected some of d_scaling, smooth_displacements, ",
-        ),
-        ({"tfeti_mpgp_alpha": 3}, r"-tfeti_mpgp_alpha 3.0: expected more than 0, at most 2"),
-    ],
-)
-def test_options_that_do_not_fit(given, message):
-    with pytest.raises(InputError, match=message):
-        parse_options(given, "tfeti_")
-
-
 def test_named_mechanisms_are_switched_off():
     options = parse_options({"tfeti_without": "d_scaling, recycled_directions"}, "tfeti_")
     assert options.without == ("d_scaling", "recycled_directions")

@@ -240,8 +240,9 @@ def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
             )
         return _near_factor_names(name.removeprefix(family[0]), f"{prefix}{family[0]}")
     low = name.lower()
-    near = [option for option in known if option == low or low.endswith(f"_{option}")]
-    near += [n for n in difflib.get_close_matches(low, known) if n not in near]
+    near = [o for o in known if o == low or low.endswith(f"_{o}") or o.startswith(f"{low}_")]
+    alike = difflib.get_close_matches(low, known, cutoff=0.72)  # not those alike in _type alone
+    near += [n for n in alike if n not in near]
     if near:
         return f"expected {_listed(near, prefix, ' or ')} perhaps; -{prefix}view prints all options"
     return f"expected one of {_listed(known, prefix, ', ')}"

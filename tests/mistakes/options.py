@@ -13,8 +13,8 @@ OPTIONS = {
     r"-tfeti_coarse_pc_factor_fil: factors by .* read no such option": given(
         coarse_pc_factor_fil=2
     ),
-    r"unknown option -tfeti_rtoll; expected -tfeti_rtol or .* perhaps": given(tfeti_rtoll=1e-6),
-    r"-tfeti_wibble; expected one of -tfeti_qp_type, ": given(wibble=1),
+    r"unknown option -tfeti_rtoll; expected -tfeti_rtol perhaps": given(tfeti_rtoll=1e-6),
+    r"-tfeti_kplus_type; expected one of -tfeti_qp_type, ": given(kplus_type="lu"),
     r"unknown option -tfeti_ksp_type; expected -tfeti_qp_type, which chooses what solves the "
     r"dual problem: one of auto, pcpg, smalse, newton": given(ksp_type="cg"),
     r"unknown option -tfeti_sub_pc_type; factors are always Cholesky's; "
@@ -27,6 +27,11 @@ OPTIONS = {
     r"expected -tfeti_sub_pc_factor_mat_solver_type mumps with it": given(
         sub_mat_mumps_icntl_14=80, sub_pc_factor_mat_solver_type="petsc"
     ),
+    r"-tfeti_monitor 'maybe': expected a value of type bool": given(monitor="maybe"),
+    r"-tfeti_smalse_beta 1.0: expected between 0 and 1": given(smalse_beta=1.0),
+    r"-tfeti_without care: expected some of d_scaling, smooth_": given(without="d_scaling,care"),
+    r"-tfeti_mpgp_alpha 3.0: expected more than 0, at most 2": given(mpgp_alpha=3),
+    rf"-tfeti_rtol -1.0: {RTOL}": given(tfeti_rtol=-1),
     rf"-tfeti_rtol inf: {RTOL}": given(tfeti_rtol=INF),
     r"-tfeti_rtol 'tight': expected a value of type float": given(tfeti_rtol="tight"),
     r"-tfeti_max_it 2.7: expected a value of type int": given(tfeti_max_it=2.7),
