@@ -7,6 +7,7 @@ writes those of this commit to tests/expected_counts.json.
 
 import io
 import json
+import logging
 import os
 import shutil
 import subprocess
@@ -62,11 +63,14 @@ DRAWN_ON_RANKS = ("hertz_2d", "hertz_3d", "bouncing_bar")
 def run(name, folder):
     """Run a demo with all outputs: report, solution, what it printed, its folder. Collective."""
     out = io.StringIO()
+    log, said = logging.getLogger("tfeti_dolfinx"), logging.StreamHandler(out)
+    log.addHandler(said)
     file = folder / "report.json"
     drawn = MPI.COMM_WORLD.size == 1 or name in DRAWN_ON_RANKS
     arguments = ["--quick", "--report", str(file), "--output", str(folder), *["--plot"] * drawn]
     with redirect_stdout(out):
         solution, _ = demos.run(name, [*arguments, "-tfeti_converged_reason"])
+    log.removeHandler(said)
     solution.decomposition.comm.barrier()
     report = json.loads(file.read_text())
     return SimpleNamespace(

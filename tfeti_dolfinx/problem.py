@@ -226,7 +226,6 @@ class ContactProblem:
             raise
         self._compose_report()
         self._log_warnings()
-        self._system.search.warn_of(self.report.unmet_contacts)
         if self.options.view and self.decomposition.comm.rank == 0:
             options = self.options.view_text(self._settings.prefix)
             print(options, self.report.details(), sep="\n", flush=True)
@@ -325,12 +324,14 @@ class ContactProblem:
         return solution, accuracy.tolerances().jump
 
     def _log_warnings(self) -> None:
-        """Log the report's warnings on rank 0, each once, whatever figures are in it."""
+        """Log warnings on rank 0; of those that differ in figures alone only the first solve's."""
+        known = set(self._logged)
         for text in self.report.warnings:
             kind = re.sub(r"[-+.\d]+(e[-+]?\d+)?", "#", text)
-            if kind not in self._logged and self.decomposition.comm.rank == 0:
+            if kind not in known and self.decomposition.comm.rank == 0:
                 log.warning("%s", text)
             self._logged.add(kind)
+        self._system.search.warn_of(self.report.unmet_contacts)
 
     def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""
@@ -372,6 +373,7 @@ class ContactProblem:
         found = estimate(self._system, self.solution)
         known = {name: value for name, value in vars(found).items() if value is not None}
         self.report.take(with_estimates(self.report, known))
+        self._log_warnings()
         return found
 
     def update(

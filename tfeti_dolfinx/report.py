@@ -358,7 +358,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         stages = [f"{name}\xa0{s:.2g}" for name, s in most if name != "total" and s >= 0.005]
         seconds = f": {', '.join(stages)}" * bool(stages)
         accuracy = [self._measured(name) for name in SHOWN if name in self.residuals]
-        rest = len(self.contacts) - PRINTED
+        rest, warned = len(self.contacts) - PRINTED, len(self.warnings)
         rows = [
             ("model", _counted(sizes)),
             *(("contact", str(contact)) for contact in self.contacts[:PRINTED]),
@@ -368,7 +368,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
             ("solver", f"{self.solver}: {_counted(work)}"),
             ("time", f"{total:.3g} s{seconds}; {self.peak_memory_mb:.0f} MB"),
             *(("note", text) for text in self.notes),
-            *(("warning", text) for text in self.warnings),
+            *[("warnings", f"{warned} logged; report.warnings has the text")] * (warned > 0),
         ]
         head = f"tfeti_dolfinx: {self.converged_reason}" + f", solve {solves}" * (solves > 1)
         wrapped = TextWrapper(WIDTH, subsequent_indent=" " * 12, break_on_hyphens=False)
