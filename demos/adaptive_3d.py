@@ -201,7 +201,7 @@ if arguments.plot:
     tfeti.plot_pressure(
         folder / "adaptive_3d_pressure.png",
         problem.solution,
-        lambda x: np.hypot(x[:, 0], x[:, 1]),
+        lambda x: np.hypot(x[0], x[1]),
         hertz,
         limit=2 * a,
         label="r",

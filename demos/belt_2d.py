@@ -197,7 +197,7 @@ if arguments.plot:
     tfeti.plot_pressure(
         folder / "belt_2d_pressure.png",
         problem.solution,
-        lambda x: np.degrees(np.arctan2(x[:, 1], x[:, 0]) + 0.5 * np.pi) % 360.0 - 90.0,
+        lambda x: np.degrees(np.arctan2(x[1], x[0]) + 0.5 * np.pi) % 360.0 - 90.0,
         lambda angle: tension / R * np.exp(exponent * (1.0 - np.radians(angle) / theta)),
         label="angle from the held side, degrees",
         unit="MPa",

@@ -181,7 +181,7 @@ if arguments.plot:
     )
     path = folder / "cylinder_on_block_2d_pressure.png"
     units = {"label": "x [mm]", "unit": "MPa"}
-    tfeti.plot_pressure(path, problem.solution, lambda x: x[:, 0], hertz, limit=2 * a, **units)
+    tfeti.plot_pressure(path, problem.solution, lambda x: x[0], hertz, limit=2 * a, **units)
 if arguments.report:
     problem.report.write(arguments.report, comm)
 if comm.rank == 0:

@@ -146,7 +146,7 @@ if arguments.plot:
     zoom = {"focus": (0.0, 1.5 * a, 0.0), "zoom": 0.3 * R / a, "show_edges": False}
     tfeti.plot_deformed(folder / "hertz_2d_contact.png", problem.solution, factor=1.0, **zoom)
     tfeti.plot_pressure(
-        folder / "hertz_2d_pressure.png", problem.solution, lambda x: x[:, 0], hertz, limit=2 * a
+        folder / "hertz_2d_pressure.png", problem.solution, lambda x: x[0], hertz, limit=2 * a
     )
 if arguments.report:
     problem.report.write(arguments.report, comm)

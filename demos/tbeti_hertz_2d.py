@@ -188,7 +188,7 @@ if arguments.plot:
     zoom = {"focus": (0.0, 0.0, 0.0), "zoom": 25.0, "show_edges": False}
     tfeti.plot_deformed(folder / "tbeti_hertz_2d.png", problem.solution, factor=1.0, **zoom)
     path = folder / "tbeti_hertz_2d_pressure.png"
-    tfeti.plot_pressure(path, problem.solution, lambda x: x[:, 0], hertz, limit=2 * a)
+    tfeti.plot_pressure(path, problem.solution, lambda x: x[0], hertz, limit=2 * a)
 if arguments.report:
     problem.report.write(arguments.report, comm)
 if comm.rank == 0:

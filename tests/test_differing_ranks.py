@@ -233,7 +233,7 @@ CASES = {
         lambda s, folder: plot_pressure(
             folder / "a.png",
             s.solved(contacts=[floor(), floor()]).solution,
-            lambda x: x[:, 0],
+            lambda x: x[0],
             contact=int(ODD),
         ),
         rf"contact is 1{ON}0 on rank 0",

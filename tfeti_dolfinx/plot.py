@@ -7,13 +7,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from dolfinx import plot as dplot
+from mpi4py import MPI
 
 from tfeti_dolfinx import draw
 from tfeti_dolfinx.common.agreement import agreeing
@@ -163,7 +166,7 @@ def plot_pressure(
     Args:
         path: The ``.png`` to write.
         solution: The solution.
-        coordinate: From points of shape ``(n, 3)`` to the coordinate, shape ``(n,)``.
+        coordinate: From points, shape ``(3, n)``, to the coordinate, shape ``(n,)``.
         closed_form: Pressure at given coordinates.
         contact: Index of the contact.
         limit: Largest coordinate shown, in magnitude.
@@ -183,14 +186,13 @@ def plot_pressure(
         given |= {"coordinate": coordinate, "label": label, "unit": unit}
         target = checked_path(path, ".png")
         checked_type(unit, str, "unit", "a string")
-        checked_callable(coordinate, "coordinate", "a callable of points of shape (n, 3)")
+        checked_callable(coordinate, "coordinate", "a callable of points of shape (3, n)")
         if closed_form is not None:
             checked_callable(closed_form, "closed_form", "a callable of coordinates of shape (n,)")
         if limit is not None:
             checked_number(limit, "limit", POSITIVE)
     data = solution.contact(contact)
-    with raised_on_all_ranks(comm):
-        x = values_at(coordinate, data.points, data.pressure.shape, "coordinate of")
+    x = _coordinates(coordinate, data.points, comm)
     parts = comm.gather((x, data.pressure), root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
@@ -198,6 +200,22 @@ def plot_pressure(
             labels = label, f"contact pressure [{unit}]" if unit else "contact pressure"
             _draw_curve(target, x, p, closed_form, limit, labels)
     return target
+
+
+def _coordinates(coordinate: Callable[[Array], Array], points: Array, comm: MPI.Intracomm) -> Array:
+    """Return the coordinate of points, ``(n, 3)``; functions of such points warn. Collective."""
+    size = (len(points),)
+    try:
+        with raised_on_all_ranks(comm):
+            return values_at(coordinate, points.T, size, "coordinate of")
+    except InputError:
+        with suppress(InputError):
+            with raised_on_all_ranks(comm):
+                x = values_at(coordinate, points, size, "coordinate of")
+            text = "coordinate gets points of shape (3, n), as x[0]; expected no x[:, 0]"
+            warnings.warn(text, DeprecationWarning, stacklevel=3)
+            return x
+        raise
 
 
 def plot_friction(
@@ -283,16 +301,9 @@ def _grid(solution: Solution, fields: dict[str, Array]) -> dict[str, Array]:
     moved = np.zeros_like(points)
     bs = u.function_space.dofmap.index_map_bs
     moved[:, :bs] = u.x.array.reshape(-1, bs)
+    grid: dict[str, Array] = {"cells": cells, "types": types, "points": points, "moved": moved}
     body = decomposition.body_of_subdomain[subdomain]
-    return {
-        "cells": cells,
-        "types": types,
-        "points": points,
-        "moved": moved,
-        **fields,
-        "body": body,
-        "subdomain": subdomain,
-    }
+    return {**grid, **fields, "body": body, "subdomain": subdomain}
 
 
 def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:

@@ -59,13 +59,13 @@ PICTURES = {
     r"zoom=0: expected a positive number": picture(zoom=0),
     r"focus=\(0, 0\): expected three finite numbers": picture(focus=(0, 0)),
     r"cut=\(0, 0, 0\): expected a point and a normal": picture(cut=(0, 0, 0)),
-    r"coordinate of points of shape \(\d, 3\) has the shape \(\d, 3\); expected \(\d,\)": curve(
+    r"coordinate of points of shape \(3, \d\) has the shape \(3, \d\); expected \(\d,\)": curve(
         lambda x: x
     ),
     r"closed_form is an array of shape \(3,\); expected a callable": curve(
-        lambda x: x[:, 0], np.zeros(3)
+        lambda x: x[0], np.zeros(3)
     ),
-    r"unit is 3; expected a string": curve(lambda x: x[:, 0], unit=3),
+    r"unit is 3; expected a string": curve(lambda x: x[0], unit=3),
 }
 
 TABLES = ("FIELDS", "FILES", "PICTURES")
