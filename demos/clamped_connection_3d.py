@@ -181,7 +181,7 @@ for name, across in (("upper end", (0, 1)), ("bolts below", (0, 2)), ("bolts abo
 # ## Contact
 #
 # Nearly all nodes of the bars slip. Newton's method on Coulomb's law does not mind; problems
-# with given bounds alone (`-tfeti_friction_type fixed_point`) take three times as long.
+# with given bounds alone (`-tfeti_friction_type fixed_point`) take longer.
 
 law = tfeti.Coulomb(arguments.friction)
 pairs = {"upper outside": "lower inside"}
