@@ -229,6 +229,8 @@ def plot_friction(
 ) -> Path:
     """Draw contact nodes coloured by status, with arrows of their tractions. Collective.
 
+    Arrows of tractions that stand out, as at corners, are shortened.
+
     Args:
         path: The ``.png`` to write, by rank 0.
         solution: A solution with friction.
@@ -394,8 +396,10 @@ def _draw_status(
 
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
-    size = np.quantile(np.linalg.norm(arrows, axis=1), 0.95) if len(x) else 0.0  # corners stand out
+    length = np.linalg.norm(arrows, axis=1)
+    size = np.quantile(length, 0.95) if len(x) else 0.0
     if size > 0.0:
+        arrows = arrows / np.maximum(length / (2.0 * size), 1.0)[:, None]
         scale = 14.0 * size / np.linalg.norm(np.ptp(x, axis=0))
         axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=scale, width=0.0015)
         axes.update_datalim(x + arrows / scale)

@@ -184,7 +184,7 @@ class ContactSearch:
         self.said = self.said + new
         for contact in new:
             if self._dofs.comm.rank == 0:
-                log.warning("contact %s has nothing within reach, and no constraints", contact)
+                log.warning("contact %s has nothing within reach=, and no constraints", contact)
 
     def _approach(self, contact: ContactPartner, u: Array) -> float:
         """Bound how much nearer two surfaces have come, 0 of an obstacle, the same on all ranks.
