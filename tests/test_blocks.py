@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
 from tfeti_dolfinx.subdomains import factor
 from tfeti_dolfinx.subdomains import sparse_block as traced
-from tfeti_dolfinx.subdomains.block import Counters, SubdomainData, candidate_modes, kernel_of
+from tfeti_dolfinx.subdomains.block import SubdomainData, candidate_modes, kernel_of
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
@@ -54,8 +54,8 @@ def data(K, x, every=3, **changes):
     return SubdomainData(**{**arguments, **changes})
 
 
-def block(K, x, every=3, counters=None, **changes):
-    return SparseBlock(data(K, x, every, **changes), InverseFactory(counters or Counters()))
+def block(K, x, every=3, how=None, **changes):
+    return SparseBlock(data(K, x, every, **changes), how)
 
 
 @pytest.mark.parametrize(("what", "left"), [("scalar", 1), ("mass", 0), ("spring", 3)])
@@ -76,18 +76,18 @@ def test_any_class_of_blocks_can_be_checked():
 def test_factors_are_made_when_they_are_needed_and_kept():
     """K's for any load and trace, K_ii's for a trace, when somebody asks for S."""
     K, x = stiffness("hexahedron", 2)
-    counters = Counters()
-    b = block(K, x, counters=counters)
+    how = InverseFactory()
+    b = block(K, x, how=how)
     b.apply_stiffness(b.apply_pinv(np.ones(len(b.trace_dofs))))
     load = 2 * b.load
     b.update(f=load)
     assert np.array_equal(b.load, load)
-    assert counters.factorizations == 1
+    assert how.factorizations == 1
     b.apply_schur(np.ones(len(b.trace_dofs)))
-    assert counters.factorizations == 2
+    assert how.factorizations == 2
     b.retrace(np.arange(0, K.shape[0], 2))
     check_block(b, K)
-    assert counters.factorizations == 3
+    assert how.factorizations == 3
 
 
 def infinite(K):

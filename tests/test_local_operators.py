@@ -95,16 +95,15 @@ def test_all_forms_apply_the_same(cell, equal):
 def test_equal_subdomains_are_factored_once():
     d = cubes("tetrahedron")
     p, subdomains = made(d, "shared", tfeti_pc_type="lumped")
-    counters = subdomains.counters
     ranks_with_any = d.comm.allreduce(int(len(d.subdomains) > 0))
-    assert d.comm.allreduce(counters.factorizations) == ranks_with_any
+    assert d.comm.allreduce(p._system.how.factorizations) == ranks_with_any
     assert len({id(block.stiffness) for block in subdomains.blocks}) <= 1
     forms = subdomains.local_operator("pinv")
     forms.prepare()
     assert sum(forms.forms.values()) == len(subdomains.blocks)
     p.destroy()
     p, subdomains = made(d, "implicit", tfeti_pc_type="lumped")
-    assert subdomains.counters.factorizations == len(subdomains.blocks)
+    assert p._system.how.factorizations == len(subdomains.blocks)
     assert len({id(block.stiffness) for block in subdomains.blocks}) == len(subdomains.blocks)
     p.destroy()
 

@@ -29,7 +29,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.solve.solver import resolved
-from tfeti_dolfinx.subdomains.block import Counters, RigidBlock, SubdomainData, mode_names
+from tfeti_dolfinx.subdomains.block import RigidBlock, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.factor import added_options, say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import InverseFactory, regularised
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
@@ -72,19 +72,17 @@ class Settings:
             },
         }
 
-    def inverses(self, counters: Counters) -> InverseFactory:
-        """Return the factory of the subdomains' generalised inverses."""
-        kplus = self.extensions.kplus or regularised
-        return InverseFactory(counters, kplus, f"{self.prefix}sub_")
+    def inverses(self) -> InverseFactory:
+        """Return a factory of the subdomains' generalised inverses."""
+        return InverseFactory(self.extensions.kplus or regularised, f"{self.prefix}sub_")
 
     def make_subdomains(
         self,
         data: Iterable[SubdomainData],
         dofs: TornDofs,
-        counters: Counters,
+        equals: EqualSubdomains,
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
         tools: Tools | None = None,
-        equals: EqualSubdomains | None = None,
         tangents: bool = False,
     ) -> Subdomains:
         """Make a Block of each subdomain, whose data is let go then, and one of all. Collective.
@@ -98,9 +96,8 @@ class Settings:
         own, options, decomposition = self.extensions, self.options, dofs.decomposition
         expected = options.local_multiplications // (OF_TANGENT if tangents else 1)
         choice = LocalChoice(options.local_type, expected)
-        how = self.inverses(counters)
-        found = (equals or EqualSubdomains(how)) if choice.type in ("auto", "shared") else None
-        make = own.block or (lambda item: SparseBlock(item, how, found))
+        found = equals if choice.type in ("auto", "shared") else None
+        make = own.block or (lambda item: SparseBlock(item, equals.how, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
         rigid, count = list[RigidBlock](), len(tools.free_names) if tools else 0
@@ -123,7 +120,7 @@ class Settings:
         with added_options(self.prefix, self.factor_options):
             with raised_on_all_ranks(dofs.comm):
                 blocks = [make(item) for item in data]
-            return kind([*blocks, *rigid], bodies, count, dofs.comm, counters, choice)
+            return kind([*blocks, *rigid], bodies, count, dofs.comm, choice)
 
     def make_dual(
         self,
@@ -191,6 +188,7 @@ class System:
         tools: The rigid bodies.
         time: That of the rigid bodies' laws.
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
+        how: Makes K⁺ of subdomains.
         inverses: How often K⁺ was made; multipliers μ of Gλ = e belong to one of them.
         follows: Whether each stiffness is near the one before, as in Newton's method: what is known
             of ‖F‖, and the weights that rows are scaled with, stay. So multipliers go on.
@@ -219,8 +217,8 @@ class System:
         self._rest: Array | None = None
         self._known_slips: tuple[ContactRecords, Array] | None = None
         self._stale, self._made = set(STAGES), Counter[str]()
-        self._counters, self._counted = Counters(), 0
-        self._equals = EqualSubdomains(settings.inverses(self._counters))
+        self.how, self._counted = settings.inverses(), 0
+        self._equals = EqualSubdomains(self.how)
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self.inverses, self.follows = 0, False
         self.weights: Array | None = None
@@ -366,7 +364,7 @@ class System:
         done, self._made = self._made, Counter()
         new = {*done, *(BRINGS.get(name) for name in done), *self._stale}
         has_kernel = self._dual is None or self.dual.coarse.dimension > 0
-        before, self._counted = self._counted, self._counters.factorizations
+        before, self._counted = self._counted, self.how.factorizations
         return StageCounts(
             factorizations=int(summed(self._dofs.comm, np.array([self._counted - before]))[0]),
             coarse_factorizations=done["coarse problem"] if has_kernel else 0,
@@ -390,7 +388,7 @@ class System:
 
     def _assemble_stiffness(self) -> None:
         K = self.forms.stiffness()
-        self._blocks = self.elements.node_blocks(K, self._settings.inverses(self._counters))
+        self._blocks = self.elements.node_blocks(K, self.how)
         self._K = K
         if self.elements.replaces:  # the load that a force per volume makes depends on S
             self.change("load")
@@ -456,10 +454,9 @@ class System:
         self._subdomains = self._settings.make_subdomains(
             subdomain_data(dofs, dofs.decomposition, self._K, self._f, trace),
             dofs,
-            self._counters,
+            self._equals,
             self.elements.blocks,
             self.tools if self.tools.num_unknowns else None,
-            self._equals,
             self.follows,
         )
         self._K, self._subdomains.tangents = None, self.follows

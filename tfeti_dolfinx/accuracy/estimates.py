@@ -72,8 +72,8 @@ def estimate(system: System, solution: Solution) -> Estimates:
             "estimate: the constraints are not those of the solution; expected a call after solve()"
         )
     dual, u = system.dual, system.subdomains.with_rigid(solution.u)
-    comm, counters = dual.coarse.comm, dual.subdomains.counters
-    start, factored = perf_counter(), counters.factorizations
+    comm, how, start = dual.coarse.comm, system.how, perf_counter()
+    factored = how.factorizations
     bound = energy_bound(dual, solution.lam, u, dual.seen)
     squares = [float(sum(dual.subdomains.energies(u))), 0.0]
     if solution.has_stress:
@@ -84,7 +84,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
         energy=float(energy),
         algebraic=bound.error,
         discretisation=float(discretisation) if solution.has_stress else None,
-        factorizations=comm.allreduce(counters.factorizations - factored),
+        factorizations=comm.allreduce(how.factorizations - factored),
         lifting_multiplications=1,
         recoveries=int(bound.moved > 0.0),
         seconds=perf_counter() - start,

@@ -382,7 +382,7 @@ class SurfaceStiffness:
 
     def _inner_factor(self) -> CholeskyFactor:
         cut = self._cut
-        self._how.counters.factorizations += 1
+        self._how.factorizations += 1
         try:
             return CholeskyFactor(self.K_fem[cut:, cut:].tocsr(), self._how.prefix)
         except FactorError as error:

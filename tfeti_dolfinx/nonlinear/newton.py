@@ -25,10 +25,6 @@ class NewtonTolerances:
             and places anew.
         loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
             0.01.
-        steepest: In small strain forcing expects the next increment to be at least this share of
-            the last one: the slope along one step does not see all that is left.
-        flattest: And at most this: at that of a kept tangent a new one would be solved to more
-            than it moves.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
@@ -38,12 +34,11 @@ class NewtonTolerances:
         rounding: Share of dᵀD d, D the diagonal of J, that is rounding of dᵀJ d: a rigid step has
             no energy.
         shortest: Length at which a step that turns cells inside out is given up.
-        keeping: In small strain a tangent is kept, with its factors, where the last remainder was
-            at most this: its directions of conjugate gradients then serve the next problems, too.
-        settled: And where the increment was at most this share of the load step's first one.
+        settled: In small strain a tangent is kept, with its factors, where the last increment was
+            at most this share of the load step's first one: its directions of conjugate gradients
+            then serve the next problems, too.
         frozen: In finite strain tangent and places are kept until the increment is at most this
             share of the first one that they gave.
-        most_frozen: For so many linearised problems at most.
         turning: Where the first increment with new places is more than this share of that with the
             last ones, contact changes more by where bodies are than by their stresses: from then on
             places are new for each linearised problem.
@@ -56,26 +51,20 @@ class NewtonTolerances:
         another: Of J along a step: a difference beyond it is that of another tangent.
         turned: Angle by which a body is turned to see whether F is one of finite strain.
         alike: Of the residual of a stretch: residuals nearer to each other are the same.
-        other: Anderson's acceleration begins anew where an increment is so many times the last
-            one, as with constraints of new places.
     """
 
     max_it: int = 50
     safety: float = 10.0
     forcing: float | None = None
     loosest: float | None = None
-    steepest: float = 0.1
-    flattest: float = 0.25
     nothing: float = 1e-12
     nowhere: float = 1e-13
     curvature: float = 0.5
     max_line_search: int = 12
     rounding: float = 1e-11
     shortest: float = 0.01
-    keeping: float = 0.5
     settled: float = 0.05
     frozen: float = 0.1
-    most_frozen: int = 4
     turning: float = 0.03
     anderson: int = 5
     dependent: float = 1e-12
@@ -84,17 +73,13 @@ class NewtonTolerances:
     another: float = 0.3
     turned: float = 0.1
     alike: float = 1e-6
-    other: float = 2.0
 
 
 class ModelKeeping:
     """Decides whether the next linearised problem has the model of the last one.
 
-    That is J with its factors, and in finite strain the rows of the same places, too.
-
-    Attributes:
-        kept: Whether the present model is that of the linearised problem before.
-        before: Size of the last increment.
+    That is J with its factors, and in finite strain the rows of the same places, too. ``kept``:
+    whether the present model is that of the linearised problem before.
     """
 
     def __init__(self, tolerances: NewtonTolerances, finite: bool) -> None:
@@ -103,27 +88,20 @@ class ModelKeeping:
 
     def begin(self) -> None:
         """Begin a load step with a new model."""
-        self.kept, self.before, self._first, self._of_model, self._uses = False, 0.0, 0.0, 0.0, 0
+        self.kept, self._first, self._of_model, self._before = False, 0.0, 0.0, 0.0
 
-    def is_slow(self, size: float) -> bool:
-        """Return whether an increment of a kept model is hardly less than the last one."""
-        return self.kept and size > self._tolerances.slow * self.before
-
-    def next(self, size: float, t: float, remainder: float) -> bool:
-        """Return whether to keep the model after an increment, its length t and remainder."""
-        tol, slow = self._tolerances, self.is_slow(size)
-        self._first = self._first or size
-        if not self.kept:
-            turns = self._of_model > 0.0 and size > tol.turning * self._of_model
-            self._freezes = self._freezes and not turns
-            self._of_model, self._uses = size, 0
-        self._uses += 1
+    def next(self, size: float, t: float) -> bool:
+        """Return whether to keep the model after an increment and its length t."""
+        tol = self._tolerances
+        self._first, slow = self._first or size, self.kept and size > tol.slow * self._before
         if self._finite:
-            wanted = self._uses == 1 or size > tol.frozen * self._of_model
-            good = self._freezes and wanted and self._uses <= tol.most_frozen
+            if not self.kept:
+                turns = self._of_model > 0.0 and size > tol.turning * self._of_model
+                self._freezes, self._of_model = self._freezes and not turns, size
+            good = self._freezes and (not self.kept or size > tol.frozen * self._of_model)
         else:
-            good = remainder <= tol.keeping and size <= tol.settled * self._first
-        self.kept, self.before = good and t == 1.0 and not slow, size
+            good = size <= tol.settled * self._first
+        self.kept, self._before = good and t == 1.0 and not slow, size
         return self.kept
 
 

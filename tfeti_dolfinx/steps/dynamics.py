@@ -34,7 +34,7 @@ from tfeti_dolfinx.qp.sets import FeasibleSet
 from tfeti_dolfinx.saved_state import SavedState
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
-from tfeti_dolfinx.subdomains.block import Counters
+from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, subdomain_data
 from tfeti_dolfinx.system import Settings
 
@@ -150,7 +150,8 @@ class Predictor:
         if M is not self._M:
             self.destroy()
             data = subdomain_data(dofs, dofs.decomposition, M, f, constraints.trace)
-            self._subdomains = settings.make_subdomains(data, dofs, Counters())
+            equals = EqualSubdomains(settings.inverses())
+            self._subdomains = settings.make_subdomains(data, dofs, equals)
             self._M, new_rows = M, True
         assert self._subdomains is not None
         self._subdomains.update(f=dofs.to_primal(f))

@@ -14,14 +14,7 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.errors import InputError
 
-# --- Input and counters of Blocks -------------------------------------------------------------
-
-
-@dataclass
-class Counters:
-    """Counters of a rank's Blocks."""
-
-    factorizations: int = 0  # factorisations
+# --- Input of Blocks --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.subdomains.block import Counters, candidate_modes
+from tfeti_dolfinx.subdomains.block import candidate_modes
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
 # --- K⁺ -----------------------------------------------------------------------------------------
@@ -75,13 +75,13 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     return K + added  # of scipy, which leaves out what is 0
 
 
-@dataclass(frozen=True)
+@dataclass
 class InverseFactory:
     """Factory of generalised inverses."""
 
-    counters: Counters = field(default_factory=Counters)  # counts factorisations
     kplus: MakeInverse = regularised  # makes the generalised inverse
     prefix: str = "tfeti_sub_"  # prefix of the factors' PETSc options
+    factorizations: int = 0  # of this rank so far
 
 
 # --- Causes of indefinite stiffnesses -----------------------------------------------------------

@@ -60,7 +60,7 @@ class Stiffness:
         length = np.linalg.norm(x - centre, axis=1).max()
         self.diagonal = K.diagonal()
         self.kernel = R = kernel_of(K, candidate_modes(x, self.bs, centre, length))
-        how.counters.factorizations += 1
+        how.factorizations += 1
         fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
             self._pinv: GeneralisedInverse = how.kplus(K, R, fixing, how.prefix)
@@ -135,7 +135,7 @@ class Traced:
         triangle = np.linalg.qr(stiffness.kernel[self.trace], mode="r")
         R = stiffness.kernel[inside] @ null_space(triangle, rcond=TOLERANCES.on_trace)
         how, K_ii = stiffness.how, entries_within(stiffness.K, inside, inside)
-        how.counters.factorizations += 1
+        how.factorizations += 1
         try:
             fixing = fixing_dofs(stiffness.x, inside // stiffness.bs)
             return regularised(K_ii.csr() if R.shape[1] else K_ii, R, fixing, how.prefix)
@@ -184,10 +184,13 @@ EQUAL = EqualityTolerances()
 
 
 class EqualSubdomains:
-    """The stiffnesses of a rank, each held once; ``kept`` are those that ``keep`` holds."""
+    """The stiffnesses of a rank, each held once; ``kept`` are those that ``keep`` holds.
+
+    ``how`` makes their inverses.
+    """
 
     def __init__(self, how: InverseFactory) -> None:
-        self._how = how
+        self.how = how
         self._of_shape: dict[bytes, WeakSet[Stiffness]] = defaultdict(WeakSet)
         self.kept: dict[str, tuple[Stiffness, Traced | None]] = {}
 
@@ -216,7 +219,7 @@ class EqualSubdomains:
                 return stiffness, here
             del stiffness
         self.kept.pop(name, None)  # its factors go before others are made
-        made = Stiffness(name, x, K, self._how)
+        made = Stiffness(name, x, K, self.how)
         known.add(made)
         return made, np.arange(K.shape[0], dtype=np.int32)
 

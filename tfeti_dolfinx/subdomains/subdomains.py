@@ -23,7 +23,7 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind, RigidBlock, SubdomainData
+from tfeti_dolfinx.subdomains.block import Block, OperatorKind, RigidBlock, SubdomainData
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
@@ -98,7 +98,6 @@ class Subdomains:
         body_of_block: Array,
         num_bodies: int,
         comm: MPI.Intracomm,
-        counters: Counters | None = None,
         choice: LocalChoice | None = None,
     ) -> None:
         self._choice = choice or LocalChoice()
@@ -106,7 +105,6 @@ class Subdomains:
         self.elastic = [block for block in self.blocks if not isinstance(block, RigidBlock)]
         self.num_nodal = sum(len(block.load) for block in self.elastic)
         self.num_bodies, self.comm = num_bodies, comm
-        self.counters = Counters() if counters is None else counters
         own = max((block.modes.shape[1] for block in self.blocks), default=0)
         self.num_modes = int(comm.allreduce(own, op=MPI.MAX))
         self.dof_parts = parts_of([len(block.load) for block in self.blocks])
