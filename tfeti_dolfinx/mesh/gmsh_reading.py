@@ -39,6 +39,7 @@ from tfeti_dolfinx.mesh.untorn import (
     exchange_by_key,
     facet_keys,
     facet_vertices,
+    mix,
     places,
     set_key,
 )
@@ -120,7 +121,7 @@ def check_shared(
     exchange = exchange_by_key(comm, keys)
     keys, cell_ids = exchange.send(keys), exchange.send(mesh.cell_ids)
     with raised_on_all_ranks(comm):
-        first, second = equal_pairs(node_ids)
+        first, second = equal_pairs(mix(node_ids))
         apart = np.abs(x[first] - x[second]).max(axis=1, initial=0.0) > same_place * extent
         if np.any(apart):
             i, j = first[apart][0], second[apart][0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,6 +10,7 @@ import basix
 import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
+from scipy.sparse import csc_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange
@@ -56,11 +58,20 @@ def facet_keys(cells: Array, ids: Array, cell_type: dmesh.CellType) -> Array:
 
 
 def equal_pairs(keys: Array) -> tuple[Array, Array]:
-    """Positions of keys that occur twice: ``keys[first] == keys[second]``, first < second."""
-    order = np.argsort(keys)
-    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    one, other = order[same], order[same + 1]
-    return np.minimum(one, other), np.maximum(one, other)
+    """Positions of keys that occur twice: ``keys[first] == keys[second]``, first < second.
+
+    They are keys of sets: by their first bits they are sorted, by counting, into buckets of few.
+    """
+    n = len(keys)
+    bucket = (keys >> np.uint64(64 - max(n.bit_length() - 1, 1))).astype(np.int32)
+    shape = (bucket.max(initial=0) + 1, n)
+    buckets = csc_array((np.arange(n), bucket, np.arange(n + 1)), shape=shape).tocsr()
+    keys, pairs = keys[buckets.data], [np.empty((2, 0), dtype=np.int64)]
+    for apart in range(1, np.diff(buckets.indptr).max(initial=1)):
+        same = np.flatnonzero(keys[apart:] == keys[:-apart])
+        pairs.append(buckets.data[np.stack((same, same + apart))])
+    first, second = np.concatenate(pairs, axis=1)
+    return first, second
 
 
 def places(known: Array, ids: Array) -> Array:
@@ -124,18 +135,13 @@ class UntornMesh:
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        vertices = self.vertices.T
-        total = self.x[vertices[0]]
-        for vertex in vertices[1:]:
-            total += self.x[vertex]
-        return total / len(vertices)
+        return np.stack([c.sum(axis=0) for c in self._corners()], axis=1) / self.vertices.shape[1]
 
     def extents(self) -> Array:
         """Sides of each cell's box along the axes, shape ``(n, gdim)``."""
+        return np.stack([np.ptp(c, axis=0) for c in self._corners()], axis=1)
+
+    def _corners(self) -> Iterator[Array]:
+        """Give one coordinate after the other of the vertices, shape ``(vertices_per_cell, n)``."""
         vertices = self.vertices.T
-        low = self.x[vertices[0]]
-        high = low.copy()
-        for vertex in vertices[1:]:
-            np.minimum(low, self.x[vertex], out=low)
-            np.maximum(high, self.x[vertex], out=high)
-        return high - low
+        yield from (np.ascontiguousarray(c)[vertices] for c in self.x.T)
