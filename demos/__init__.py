@@ -13,6 +13,7 @@ from typing import Any
 from petsc4py import PETSc
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.steps.load_steps import StepRecord
 
 
 class Made(Exception):  # noqa: N818  # it is no error
@@ -26,11 +27,11 @@ def run(name: str, arguments: Sequence[object] = ()) -> tuple[Any, Any]:
     return problem.solution, problem.report
 
 
-def steps_of(name: str, arguments: Sequence[object] = ()) -> list[tfeti.StepRecord]:
+def steps_of(name: str, arguments: Sequence[object] = ()) -> list[StepRecord]:
     """Run a demo of load steps in this process; the records of its steps. Collective."""
     names = names_of(name, arguments)
     names["problem"].destroy()
-    found: list[tfeti.StepRecord] = names["records"]
+    found: list[StepRecord] = names["records"]
     return found
 
 

@@ -17,6 +17,7 @@ from scenes import box, clamp, decomposed, forms, hooke
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.agreement import agreeing, described
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.output import write_xdmf
 from tfeti_dolfinx.plot import plot_pressure
 
@@ -243,7 +244,7 @@ CASES = {
         rf"surfaces: left is the callable <lambda>{ON}1 on",
     ),
     "an extension on one": (
-        lambda s, folder: s.problem(extensions=tfeti.Extensions(monitor=print) if ODD else None),
+        lambda s, folder: s.problem(extensions=Extensions(monitor=print) if ODD else None),
         rf"extensions: monitor is .*{ON}",
     ),
     "no form on one": (lambda s, folder: s.solved(L=5 if ODD else None), rf"L is 5{ON}a Form"),

@@ -6,6 +6,7 @@ from scenes import apart, curved_obstacle, decomposed, problem
 from scipy.linalg import pinvh
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator
@@ -51,13 +52,13 @@ def solved(contacts=(), extensions=None, **options):
 def test_an_inverse_of_one_s_own():
     obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))]
     known, _ = solved(obstacles)
-    own, _ = solved(obstacles, tfeti.Extensions(kplus=DensePinv))
+    own, _ = solved(obstacles, Extensions(kplus=DensePinv))
     assert apart(own, known) <= 1e-7
 
 
 def test_a_preconditioner_of_one_s_own():
     known, p = solved(tfeti_pc_type="lumped")
-    own, q = solved(extensions=tfeti.Extensions(preconditioner=doubled))
+    own, q = solved(extensions=Extensions(preconditioner=doubled))
     assert apart(own, known) <= 1e-7
     assert q.report.preconditioner_multiplications > 0
     assert abs(q.report.cg_steps - p.report.cg_steps) <= 1
@@ -75,7 +76,7 @@ def test_subdomains_and_deflation_of_one_s_own():
         asked.append("deflation")
         return SoftModes(*given)
 
-    own = tfeti.Extensions(subdomains=subdomains, deflation=deflation)
+    own = Extensions(subdomains=subdomains, deflation=deflation)
     known, _ = solved()
     found, _ = solved(extensions=own)
     assert asked == ["subdomains", "deflation"]
@@ -90,7 +91,7 @@ def test_a_monitor_of_one_s_own():
     def monitor(steps, step, x, projected_gradient, equality):
         seen.append((step, projected_gradient))
 
-    _, p = solved(extensions=tfeti.Extensions(monitor=monitor))
+    _, p = solved(extensions=Extensions(monitor=monitor))
     inner = [size for step, size in seen if step == "cg"]
     assert len(inner) == p.report.cg_steps > 3
     assert inner[-1] < 1e-3 * max(inner)

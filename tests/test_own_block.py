@@ -8,6 +8,7 @@ from test_extensions import solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.subdomains.block import Block, kernel_of
 from tfeti_dolfinx.testing import check_kind_of_block
 
@@ -42,7 +43,7 @@ def test_it_solves_a_scene(pc_type):
     contacts = [tfeti.Obstacle("bottom", curved_obstacle(3))] if pc_type == "auto" else []
     known, own = (
         solved(contacts, extensions, tfeti_pc_type=pc_type)[0]
-        for extensions in (None, tfeti.Extensions(block=DenseBlock))
+        for extensions in (None, Extensions(block=DenseBlock))
     )
     assert apart(own, known) <= 1e-7
 
@@ -51,6 +52,6 @@ def test_what_it_refuses_is_raised_on_all_ranks():
     def refuses(data):
         raise InputError(f"{data.name}: not for me")
 
-    p = problem(decomposed("quadrilateral", 4, 4), extensions=tfeti.Extensions(block=refuses))
+    p = problem(decomposed("quadrilateral", 4, 4), extensions=Extensions(block=refuses))
     with pytest.raises(InputError, match=r"subdomain \d: not for me"):
         p.solve()

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, problem
 
-from tfeti_dolfinx import Extensions, Obstacle
+from tfeti_dolfinx import Obstacle
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.qp.sets import Face, Product, Status
 from tfeti_dolfinx.testing import check_feasible_set
 

@@ -10,6 +10,7 @@ from scenes import curved_obstacle, decomposed, problem
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Face, Status
@@ -113,7 +114,7 @@ def test_clusters_send_no_pickled_messages(pickled):
 
 def test_pickled_messages_are_seen(pickled):
     """A monitor that sends a number, in each step."""
-    seen = tfeti.Extensions(monitor=lambda *_: MPI.COMM_WORLD.allreduce(1))
+    seen = Extensions(monitor=lambda *_: MPI.COMM_WORLD.allreduce(1))
     p = problem(decomposed("quadrilateral", 6, 4), extensions=seen)
     p.solve()
     assert len(pickled) > 5

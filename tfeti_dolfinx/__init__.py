@@ -28,9 +28,10 @@ Example:
     0.100000
 """
 
+import warnings
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tfeti_dolfinx.accuracy.estimates import Estimates
 from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.partner import Contact, Obstacle
@@ -44,7 +45,7 @@ from tfeti_dolfinx.errors import (
     NoSolutionError,
     TfetiError,
 )
-from tfeti_dolfinx.extensions import PLUGINS, Extensions, plugin
+from tfeti_dolfinx.extensions import PLUGINS, plugin
 from tfeti_dolfinx.forms.elasticity import Elasticity
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
@@ -54,20 +55,18 @@ from tfeti_dolfinx.nonlinear.hyperelasticity import NeoHooke, SaintVenantKirchho
 from tfeti_dolfinx.nonlinear.materials import J2Plasticity
 from tfeti_dolfinx.nonlinear.newton import NewtonTolerances
 from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
-from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.output import write_pvd, write_vtx, write_xdmf
 from tfeti_dolfinx.plot import plot_deformed, plot_friction, plot_pressure
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.solution import PointValues, Solution
+from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.steps.dynamics import ContactDynamics, NonlinearContactDynamics
-from tfeti_dolfinx.steps.load_steps import LoadSteps, StepRecord
+from tfeti_dolfinx.steps.load_steps import LoadSteps
 
 __version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
     from tfeti_dolfinx.bem.boundary_elements import BoundaryElements
-    from tfeti_dolfinx.bem.interior import Interior
 
 __all__ = [
     "BoundaryElements",
@@ -81,12 +80,9 @@ __all__ = [
     "Cylinder",
     "Decomposition",
     "Elasticity",
-    "Estimates",
-    "Extensions",
     "FactorError",
     "FiniteJ2Plasticity",
     "InputError",
-    "Interior",
     "J2Plasticity",
     "LoadSteps",
     "NeoHooke",
@@ -95,16 +91,13 @@ __all__ = [
     "NonlinearContactDynamics",
     "NonlinearContactProblem",
     "Obstacle",
-    "Options",
     "Plane",
-    "PointValues",
     "Report",
     "RigidBody",
     "SaintVenantKirchhoff",
     "SignedDistance",
     "Solution",
     "Sphere",
-    "StepRecord",
     "SurfaceMesh",
     "TfetiError",
     "Tresca",
@@ -121,8 +114,23 @@ __all__ = [
 ]
 
 
+# where what is not for every program is: its names here are those of former programs
+ELSEWHERE = {
+    "Estimates": "accuracy.estimates",
+    "Extensions": "extensions",
+    "Interior": "bem.interior",
+    "Options": "options",
+    "PointValues": "solution",
+    "StepRecord": "steps.load_steps",
+}
+
+
 def __getattr__(name: str) -> Any:
-    """Return a public name of an optional part, which is imported when it is first asked for."""
+    """Return a name of an optional part, imported when it is asked for, or one from elsewhere."""
+    if name in ELSEWHERE:
+        module = f"{__name__}.{ELSEWHERE[name]}"
+        warnings.warn(f"import {name} from {module}", DeprecationWarning, stacklevel=2)
+        return getattr(import_module(module), name)
     if name in __all__ and name in PLUGINS:
         return plugin(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -6,6 +6,7 @@ from dolfinx import fem
 from scenes import box, clamp, forms
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
 ALL = tfeti.BoundaryElements()
@@ -59,7 +60,7 @@ GIVEN = {
         boundary_elements="steel"
     ),
     r"boundary_elements: extensions have a block, too; expected one of them": lambda s: s.problem(
-        boundary_elements=ALL, extensions=tfeti.Extensions(block=SparseBlock)
+        boundary_elements=ALL, extensions=Extensions(block=SparseBlock)
     ),
 }
 SOLVED = {

@@ -4,7 +4,8 @@ import numpy as np
 from mpi4py import MPI
 
 from mistakes.scene import raising
-from tfeti_dolfinx import Extensions, Obstacle, Tresca
+from tfeti_dolfinx import Obstacle, Tresca
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.subdomains.block import Block
 
