@@ -230,6 +230,9 @@ def test_a_series_comes_back_to_rest(cell, qp_type, rtol):
         u = scene.solve(0.0, factor * value)
         assert np.abs(u).max() <= 0.02 * max(abs(factor), 1e-12)
         scene.problem.accept()
+    value[-1] = 0.0  # it only touches: what is left of no forces bounds no friction
+    assert scene.solve(0.0, value) == pytest.approx(np.tile(value, (len(u), 1)), abs=1e-5 * 0.003)
+    assert qp_type == "smalse" or scene.problem.report.F_multiplications <= 40
     scene.problem.destroy()
 
 

@@ -278,9 +278,9 @@ class FrictionBounds:
         whole = self.stick or self._length == 1.0
         self.now = self._found if whole else self.now + self._length * (self._found - self.now)
 
-    def forces_of(self, lam: Array) -> Array:
-        """Return the normal forces, those that are rounding set to 0."""
-        return np.where(lam[self._rows] > self._none, lam[self._rows], 0.0)
+    def forces_of(self, lam: Array, none: float = 0.0) -> Array:
+        """Return the normal forces, those that are rounding or at most ``none`` set to 0."""
+        return np.where(lam[self._rows] > max(self._none, none), lam[self._rows], 0.0)
 
     def _on_bodies(self, pressures: Array) -> Array:
         """Return norms of the nodal forces μ times those of normals make on each body."""
@@ -361,7 +361,7 @@ class NewtonOnLaw:
         Fx = end.s + qp.coarse.combined(end.mu) + qp.d
         dual.last.x, dual.last.Fx = end.lam, Fx
         dual.last.within = parameters.newton.unseen * target / norm
-        # the bounds of multipliers for which the law holds
-        bounds.before, bounds.now = bounds.now, bounds.forces_of(end.lam)
+        # the bounds of multipliers for which the law holds; what cannot be seen bounds none
+        bounds.before, bounds.now = bounds.now, bounds.forces_of(end.lam, dual.last.within)
         dual.bound_friction(bounds.now)
         return end.lam, end.mu
