@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
 from test_solvable_lp import dual_of
@@ -97,8 +98,10 @@ def pickled(monkeypatch):
 @pytest.mark.parametrize("qp_type", ["newton", "smalse"])
 def test_solvers_send_no_pickled_messages(pickled, qp_type, friction):
     """Starts, looks and Newton's method on Coulomb's law are counted, too."""
-    pressed = tfeti.Obstacle("bottom", curved_obstacle(2), friction=friction)
-    p = problem(decomposed("quadrilateral", 6, 4), contacts=[pressed], qp_type=qp_type)
+    d = stacked("quadrilateral", 4, 5)
+    pair = sided("upper bottom", "lower top", friction=friction)
+    sides = held(d, "lower bottom", "lower left", "upper left", ("upper top", -0.01))
+    p = two_body_problem(d, pressed(d), sides, [pair], tfeti_qp_type=qp_type)
     p.solve()
     assert p.report.F_multiplications > 5
     assert pickled == []

@@ -218,7 +218,7 @@ def products(B: PETSc.Mat, R: csr_array) -> PETSc.Mat:
 def side_by_side(own: csr_array, comm: PETSc.Comm) -> PETSc.Mat:
     """A matrix with a block for each rank, which acts on nothing of the others'. Collective."""
     index = PETSc.IntType
-    first = comm.tompi4py().exscan(own.shape[1]) or 0
+    first = chunk_offsets(comm.tompi4py(), own.shape[1])[comm.rank]
     size = ((own.shape[0], None), (own.shape[1], None))
     table = (own.indptr.astype(index), (own.indices + first).astype(index), own.data)
     return PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)

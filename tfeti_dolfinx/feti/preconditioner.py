@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix
-from tfeti_dolfinx.common.parallel import bcast_from_root, joined_over, largest, rows_over
+from tfeti_dolfinx.common.parallel import bcast_from_root, largest, rows_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import side_by_side
@@ -332,6 +332,7 @@ class ContactFactor:
         self._comm, size = A.getComm().tompi4py(), A.getSize()[0]
         first, last = A.getOwnershipRange()
         self._own = slice(first, last)
+        self._sizes = [int(count) for count in np.diff(A.getOwnershipRanges())]
         indptr, indices, data = A.getValuesCSR()
         A.destroy()
         whole = rows_over(self._comm, Entries(data, indices, indptr, (last - first, size)))
@@ -340,4 +341,6 @@ class ContactFactor:
 
     def solve(self, b: Array) -> Array:
         """A⁻¹b, of this rank's parts. Collective."""
-        return np.asarray(self._factor.solve(joined_over(self._comm, b))[self._own])
+        whole = np.empty(sum(self._sizes))
+        self._comm.Allgatherv(np.ascontiguousarray(b), [whole, self._sizes])
+        return np.asarray(self._factor.solve(whole)[self._own])
