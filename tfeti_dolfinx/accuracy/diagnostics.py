@@ -27,19 +27,11 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Quality of cells -------------------------------------------------------------------------
 
-# columns: the edges of a regular simplex that leave its first vertex
-REGULAR = {
-    "triangle": np.array([[1.0, 0.5], [0.0, 0.75**0.5]]),
-    "tetrahedron": np.array(
-        [[1.0, 0.5, 0.5], [0.0, 0.75**0.5, 12**-0.5], [0.0, 0.0, (2 / 3) ** 0.5]]
-    ),
-}
-
 
 def flatness(mesh: dmesh.Mesh) -> Array:
-    """‖J‖‖J⁻¹‖/gdim of each local cell, in Frobenius norms: 1 for a regular one, shape ``(c,)``.
+    """‖J‖‖J⁻¹‖/gdim of each local cell, in Frobenius norms: 1 for a reference cell, shape ``(c,)``.
 
-    J is the map from a regular cell, in its middle. A box whose longest edge is a times its
+    J is the map from the reference cell, in its middle. A box whose longest edge is a times its
     shortest has about a/2; cells without volume have as much as a float can be.
     """
     cell_type = mesh.topology.cell_type
@@ -50,8 +42,6 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     middle = basix.geometry(cell).mean(axis=0)[None]
     slopes = element.tabulate(1, middle)[1:, 0, :, 0]
     J = np.einsum("dv,cvg->cgd", slopes, mesh.geometry.x[corners, :gdim])
-    if cell_type.name in REGULAR:
-        J = J @ np.linalg.inv(REGULAR[cell_type.name])
     return np.asarray(np.minimum(np.linalg.cond(J, "fro") / gdim, 1.0 / TINY))
 
 
