@@ -337,6 +337,11 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         """The counters, by name."""
         return {name: getattr(self, name) for name in COUNTERS}
 
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """The sizes, by name."""
+        return {of.name: getattr(self, of.name) for of in fields(Sizes)}
+
     def __str__(self) -> str:
         sizes = (
             (self.primal_dofs, "unknowns"),
