@@ -2,15 +2,20 @@
 
 python3 -m sphinx -W --keep-going -b html -c docs . OUT
 
-With ``-t online`` types of other packages link to their pages, whose lists are fetched.
+With ``-t online`` types of other packages link to their pages, whose lists are fetched; with
+``-t executed`` each example is run at its quick size, and its page has what it prints.
 """
 
+import os
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
+from subprocess import PIPE, STDOUT
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from sphinx.application import Sphinx
@@ -121,7 +126,22 @@ def write_examples(app: Sphinx) -> None:
         pictures = sorted((ROOT / "docs/pictures").glob(f"{path.stem}*"))
         page += ["## Pictures"] * bool(pictures)
         page += [f"![{picture.stem}](../pictures/{picture.name})" for picture in pictures]
+        if app.tags.has("executed"):
+            page += ["## What it prints", f"With `--quick`:\n\n```text\n{printed(path)}\n```"]
         write_if_new(EXAMPLES / f"{path.stem}.md", "\n\n".join(page) + "\n")
+
+
+def printed(path: Path) -> str:
+    """Run a demo at its quick size; what it prints, and logs."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with TemporaryDirectory() as folder:
+        command = [sys.executable, str(path), "--quick"]
+        done = subprocess.run(
+            command, cwd=folder, env=environment, text=True, stderr=STDOUT, stdout=PIPE
+        )
+    if done.returncode != 0:
+        raise RuntimeError(f"{path.name} --quick:\n{done.stdout}")
+    return done.stdout.strip()
 
 
 def write_if_new(target: Path, text: str) -> None:
