@@ -3,7 +3,7 @@
 python3 -m sphinx -W --keep-going -b html -c docs . OUT
 
 With ``-t online`` types of other packages link to their pages, whose lists are fetched; with
-``-t executed`` each example is run at its quick size, and its page has what it prints.
+``-t executed`` each example is run at its quick size: its page has what it prints, some a 3D view.
 """
 
 import os
@@ -97,6 +97,7 @@ html_sidebars: dict[str, list[str]] = {page: [] for page in bare}
 
 # made here: a page for each demo, and one for each class and function
 EXAMPLES, API = ROOT / "docs" / "examples", ROOT / "docs" / "api"
+VIEWS = ("ball_bearing_3d", "bolted_joint_3d", "clamped_connection_3d", "stacked_blocks_3d")
 BLOCK = re.compile(r"^```\{eval-rst\}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 ENTRY = re.compile(r"^\.\. (auto\w+):: (\S+)\n((?:   .*\n)*)", re.MULTILINE)
 PICTURE = re.compile(r"\| (?:!\[(.*?)\]\((.*?)\))? *\| \[`(\w+)\.py`\]\(.*?\): (.*?) \|")
@@ -128,17 +129,23 @@ def write_examples(app: Sphinx) -> None:
         page += [f"![{picture.stem}](../pictures/{picture.name})" for picture in pictures]
         if app.tags.has("executed"):
             page += ["## What it prints", f"With `--quick`:\n\n```text\n{printed(path)}\n```"]
+            if path.stem in VIEWS:
+                scripts = (
+                    f"<script src='../../_static/{s}.js'></script>" for s in ("view", path.stem)
+                )
+                page += ["## Turn it", "```{raw} html\n" + "\n".join(scripts) + "\n```"]
         write_if_new(EXAMPLES / f"{path.stem}.md", "\n\n".join(page) + "\n")
 
 
 def printed(path: Path) -> str:
-    """Run a demo at its quick size; what it prints, and logs."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    """Run a demo at its quick size, and write the view in 3D of some; what it prints, and logs."""
+    command = [sys.executable, str(path), "--quick"]
+    if path.stem in VIEWS:
+        view = ROOT / "docs/static" / f"{path.stem}.js"
+        command = [sys.executable, str(ROOT / "docs/view.py"), path.stem, str(view)]
+    given: dict[str, Any] = {"env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
     with TemporaryDirectory() as folder:
-        command = [sys.executable, str(path), "--quick"]
-        done = subprocess.run(
-            command, cwd=folder, env=environment, text=True, stderr=STDOUT, stdout=PIPE
-        )
+        done = subprocess.run(command, cwd=folder, stderr=STDOUT, stdout=PIPE, **given)
     if done.returncode != 0:
         raise RuntimeError(f"{path.name} --quick:\n{done.stdout}")
     return done.stdout.strip()
@@ -195,6 +202,8 @@ def make_cards(app: Sphinx, page: str, source: list[str]) -> None:
         if row is not None:
             alt, file, name, text = row.groups()
             names.append(name)
+            if name in VIEWS and app.tags.has("executed"):
+                text += f" ([turn it](examples/{name}.md#turn-it))"
             image = f"[![{alt}]({file})](examples/{name}.md)\n\n" if file else ""
             rows.append(
                 f"````{{container}} card\n{image}[{name}](examples/{name}.md): {text}\n````"
