@@ -137,6 +137,7 @@ NOT_RUN = {
     "./run python3 -m benchmarks.stress": "tests/test_stress.py runs a few scenes",
     "./run python3 benchmarks/": "tests/test_benchmarks.py runs the quick sizes",
     "./run python3 -m pytest": "these tests; .ci/run starts them so",
+    "./run python3 docs/pictures.py": "the demos at their default sizes; minutes",
     "./run python3 -m sphinx ": ".ci/run builds the documents, with -W",
 }
 DIRECTIVES = ("{toctree}", "{eval-rst}")

@@ -324,11 +324,11 @@ class ContactProblem:
         return solution, accuracy.tolerances().jump
 
     def _log_warnings(self) -> None:
-        """Log warnings on rank 0; of those that differ in figures alone only the first solve's."""
-        known = set(self._logged)
+        """Log warnings on rank 0, each once, whatever figures are in what it says of its bodies."""
         for text in self.report.warnings:
-            kind = re.sub(r"[-+.\d]+(e[-+]?\d+)?", "#", text)
-            if kind not in known and self.decomposition.comm.rank == 0:
+            bodies, _, says = text.partition(": ")
+            kind = bodies + re.sub(r"[-+.\d]+(e[-+]?\d+)?", "#", says)
+            if kind not in self._logged and self.decomposition.comm.rank == 0:
                 log.warning("%s", text)
             self._logged.add(kind)
         self._system.search.warn_of(self.report.unmet_contacts)
