@@ -18,10 +18,6 @@ class InputError(TfetiError, ValueError):
     """Invalid input; the message names what is wrong and says what was expected."""
 
 
-class OverlapError(InputError):
-    """Bodies overlap deeper than contact is searched for."""
-
-
 class NoSolutionError(TfetiError, RuntimeError):
     """The problem has no solution; the message says why."""
 

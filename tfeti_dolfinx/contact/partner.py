@@ -20,7 +20,7 @@ from tfeti_dolfinx.contact.friction import FrictionLaw, numbers_at, with_frictio
 from tfeti_dolfinx.contact.records import ContactRecords, Side, conditions, relative_motion
 from tfeti_dolfinx.contact.rigid_body import Law, RigidBody
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
-from tfeti_dolfinx.errors import InputError, OverlapError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
@@ -406,7 +406,7 @@ class Contact(ContactPartner):
         found = super().gaps(dofs, records, depth)
         deepest = -dofs.comm.allreduce(float(found.min(initial=0.0)), op=MPI.MIN)
         if isinstance(self.gap, str) and deepest > depth:
-            raise OverlapError(
+            raise InputError(
                 f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the reach "
                 f"{depth:.6g}; expected bodies that are apart, a larger reach, or a gap="
             )

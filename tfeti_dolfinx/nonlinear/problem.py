@@ -20,7 +20,6 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     InputError,
-    OverlapError,
     TfetiError,
     raised_on_all_ranks,
 )
@@ -186,7 +185,7 @@ class NonlinearContactProblem(ContactProblem):
             rtol = float(np.clip(self._forcing * asked, exact, self._loosest))
             try:
                 self._solve_linearised(rtol, warns=step == 0 or rtol <= exact)
-            except OverlapError as error:  # that of an iterate, not of what was given
+            except InputError as error:  # that of an iterate, not of what was given
                 if step == 0:
                     raise
                 raise ConvergenceError(
