@@ -25,6 +25,10 @@ class NewtonTolerances:
             and places anew.
         loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
             0.01.
+        steepest: In small strain forcing expects the next increment to be at least this share of
+            the last one: the slope along one step does not see all that is left.
+        flattest: And at most this: at that of a kept tangent a new one would be solved to more
+            than it moves.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
@@ -57,6 +61,8 @@ class NewtonTolerances:
     safety: float = 10.0
     forcing: float | None = None
     loosest: float | None = None
+    steepest: float = 0.1
+    flattest: float = 0.25
     nothing: float = 1e-12
     nowhere: float = 1e-13
     curvature: float = 0.5

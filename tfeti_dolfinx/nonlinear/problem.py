@@ -198,11 +198,12 @@ class NonlinearContactProblem(ContactProblem):
             increment = size / max(largest(comm, end), TINY) if size > self._last_digit else 0.0
             # 2. line search
             t, remainder = self._line_search(u, d)
-            asked = min(remainder, 1.0) * increment  # what the next one is expected to be
+            expected = asked = min(remainder, 1.0) * increment
             # 3. end
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
-                short |= t == 1.0 and tol.safety * asked <= exact
+                asked = float(np.clip(remainder, tol.steepest, tol.flattest)) * increment
+                short |= t == 1.0 and tol.safety * expected <= exact
             nothing = largest(comm, end) <= max(tol.nothing * first, self._least)
             if nothing or (short and rtol <= exact):
                 self._set(end)
