@@ -32,7 +32,7 @@ from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
-from tfeti_dolfinx.mesh.untorn import cell_facets
+from tfeti_dolfinx.mortar.facets import facet_nodes
 
 # --- Rows of interfaces and Dirichlet conditions ----------------------------------------------
 
@@ -172,7 +172,7 @@ def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
     decomposition = dofs.decomposition
     if not bcs or not decomposition.is_torn:
         return
-    tears, outer = (_facet_nodes(dofs, f) for f in (decomposition.tears, decomposition.boundary))
+    tears, outer = (facet_nodes(dofs, f) for f in (decomposition.tears, decomposition.boundary))
     at_boundary = np.zeros(dofs.num_nodes, dtype=bool)
     at_boundary[outer] = True
     at_boundary = dofs.spread(dofs.reduce(at_boundary, np.logical_or))
@@ -201,17 +201,6 @@ def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
             "body, and nodes of a region that are not on the boundary, are for a condition of "
             "their own"
         )
-
-
-def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
-    """Return the primal nodes of local facets of one cell, shape ``(f, nodes per facet)``."""
-    V, of_cells = dofs.V, cell_facets(dofs.V.mesh)
-    chosen = np.zeros(int(of_cells.max(initial=-1)) + 1, dtype=bool)
-    chosen[facets] = True
-    cell, place = np.nonzero(chosen[of_cells])
-    element, fdim = V.element.basix_element, V.mesh.topology.dim - 1
-    on_facet = np.array(element.entity_closure_dofs[fdim])[place]
-    return dofs.primal_node[np.take_along_axis(np.asarray(V.dofmap.list)[cell], on_facet, axis=1)]
 
 
 def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:

@@ -200,9 +200,7 @@ def friction_values(
 def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
     """Values of a function at the owned groups, the mean over the torn copies. Collective."""
     S, dof = dofs.scalar
-    if function.function_space.mesh is not S.mesh and (
-        function.function_space.mesh._cpp_object is not S.mesh._cpp_object
-    ):
+    if function.function_space.mesh._cpp_object is not S.mesh._cpp_object:
         raise InputError(
             f"{what} is on another mesh; expected a function on decomposition.mesh, the torn "
             "mesh, where decomposition.from_original takes functions"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
+from scipy.sparse import coo_array
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import Exchange, owner_of, summed
@@ -206,15 +207,12 @@ def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
     """Return triplets on the ranks that own their rows (as local slots), equal ones added up."""
     row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, row))
-    row = exchange.send(row) - dofs.group_offsets[dofs.comm.rank]
-    column, value = exchange.send(column), exchange.send(value)
-    order = np.lexsort((column, row))
-    row, column, value = row[order], column[order], value[order]
-    first = np.ones(len(row), dtype=bool)
-    first[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
-    starts = np.flatnonzero(first)
-    sums = np.add.reduceat(value, starts) if len(value) else value
-    return row[first], column[first], sums
+    place = exchange.send(row) - dofs.group_offsets[dofs.comm.rank], exchange.send(column)
+    shape = dofs.num_groups, int(dofs.group_offsets[-1])
+    sums = coo_array((exchange.send(value), place), shape=shape).tocsr()
+    sums.sum_duplicates()
+    row = np.repeat(np.arange(dofs.num_groups), np.diff(sums.indptr))
+    return row, sums.indices.astype(np.int64), sums.data
 
 
 # --- Forces on nodes, surfaces and bodies -----------------------------------------------------

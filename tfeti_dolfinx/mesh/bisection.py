@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import box_over_ranks
+from tfeti_dolfinx.common.parallel import box_over_ranks, summed
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def _halves(
         np.minimum.at(box[0, :, axis], part, column)
         np.minimum.at(box[1, :, axis], part, -column)
     comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
-    count, gap = _count(part, len(whole), comm), None
+    count, gap = sizes_of(part, len(whole), comm), None
     axes = (np.argmax(-box[1] - box[0], axis=1)[:, None] + np.arange(gdim)) % gdim
     if sizes is not None:
         largest = np.maximum(sizes.max(axis=1, initial=1)[:, None], 1)
@@ -103,7 +103,7 @@ def _halves(
         np.add.at(total[0], part, sizes)
         np.add.at(total[1], part, (sizes << 10) // largest)
         comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-        flat = _count(part, len(whole), comm, is_flat) > 0
+        flat = sizes_of(part[is_flat], len(whole), comm) > 0
         if gdim == 3:  # of two ties the thinner axis is the last to be cut across
             thick = np.take_along_axis(total[1], axes, axis=1)
             turned = flat & (thick[:, 1] < thick[:, 2])
@@ -140,7 +140,7 @@ def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Ar
         high, is_high = _end_of_layer(-c, own, -at, gap, comm)
         same = (PARAMETERS.same_place * gap).astype(np.int64)
         ends = np.stack((low - same - 1, same - high))  # the largest coordinates on the left
-        left = np.stack([before + _count(own, num_parts, comm, c <= end[own]) for end in ends])
+        left = np.stack([before + sizes_of(own[c <= end[own]], num_parts, comm) for end in ends])
         off = np.where([is_low, is_high], np.abs(left - halves.wanted), np.inf)
         better, parts = np.argmin(off, axis=0), np.arange(num_parts)
         moves = (gap >= 0) & (off[better, parts] <= halves.may)
@@ -171,10 +171,9 @@ def _end_of_layer(
     return end, found
 
 
-def _count(part: Array, num_parts: int, comm: MPI.Intracomm, chosen: Array | None = None) -> Array:
-    counts = np.bincount(part if chosen is None else part[chosen], minlength=num_parts)
-    comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
-    return counts
+def sizes_of(part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
+    """Count the points of each part on all ranks. Collective."""
+    return summed(comm, np.bincount(part, minlength=num_parts))
 
 
 def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Array:
@@ -184,7 +183,7 @@ def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Arr
     while np.any(low < high):
         middle = (low + high) // 2
         first = key <= middle[part]
-        count = _count(part, len(k), comm, first)
+        count = sizes_of(part[first], len(k), comm)
         enough = count >= k
         kept = first == enough[part]
         key, part, k = key[kept], part[kept], np.where(enough, k, k - count)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from tfeti_dolfinx.common.arrays import TINY, Array, sum_rows
 from tfeti_dolfinx.common.parallel import box_over_ranks, summed
 from tfeti_dolfinx.mesh.bisection import PARAMETERS as BISECTION
-from tfeti_dolfinx.mesh.bisection import bisect_points
+from tfeti_dolfinx.mesh.bisection import bisect_points, sizes_of
 from tfeti_dolfinx.mesh.cell_graph import CellGraph
 from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
 
@@ -55,7 +55,7 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
         return body
     extents = mesh.extents()
     flat = np.any(BISECTION.flat * extents <= extents.max(axis=1, initial=0.0)[:, None], axis=1)
-    boxes = 2 * _counts(comm, body[flat], len(sizes)) > sizes
+    boxes = 2 * sizes_of(body[flat], len(sizes), comm) > sizes
     boxes |= (sizes < ROUND.fewest * shares) | (shares == 1)
     # integers, so that sums do not depend on how ranks share the points
     x = mesh.midpoints()
@@ -69,15 +69,11 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     if not np.all(boxes):
         some = ~boxes[body]
         part[some] = balanced_kmeans(grid[some], key[some], body[some], shares, comm)
-        boxes[home[_counts(comm, part[some], len(home)) == 0]] = True
+        boxes[home[sizes_of(part[some], len(home), comm) == 0]] = True
     if np.any(boxes):
         some = boxes[body]
         part[some] = bisect_points(x[some], shares, comm, extents[some], body=body[some])
     return part
-
-
-def _counts(comm: MPI.Intracomm, part: Array, num_parts: int) -> Array:
-    return summed(comm, np.bincount(part, minlength=num_parts))
 
 
 def _shares(weights: Array, num_parts: int) -> Array:
@@ -103,7 +99,7 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
     beginning. Return the part of each point.
     """
     home = np.repeat(np.arange(len(shares)), shares)
-    total, (n, gdim) = int(_counts(comm, body, len(shares)).sum()), x.shape
+    total, (n, gdim) = int(sizes_of(body, len(shares), comm).sum()), x.shape
     centre = np.zeros((len(home), gdim))
     apart = 2.0 ** (ROUND.bits + 2)  # bodies are along one more axis
 
@@ -120,13 +116,13 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
             centre = _means(y, own, centre, comm)
             away = np.rint(np.sqrt(_squares(y, centre[own])))
             spread = summed(comm, sum_rows(own, away, len(home)))
-            influence = np.maximum(spread / np.maximum(_counts(comm, own, len(home)), 1), 1.0)
+            influence = np.maximum(spread / np.maximum(sizes_of(own, len(home), comm), 1), 1.0)
         else:
             own = centres().query(np.column_stack((y, apart * of)))[1].astype(np.int64)
             own = _nearest(y, own, centre, influence, home)
-        goal = (_counts(comm, of, len(shares)) / shares)[home]
+        goal = (sizes_of(of, len(shares), comm) / shares)[home]
         for _ in range(rounds):
-            size = np.maximum(_counts(comm, own, len(home)), 1)
+            size = np.maximum(sizes_of(own, len(home), comm), 1)
             if way:
                 centre += way * (_means(y, own, centre, comm) - centre)
             elif np.all((size < ROUND.largest * goal) & (size > ROUND.smallest * goal)):

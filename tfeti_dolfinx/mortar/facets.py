@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache
 from typing import Any
 
 import basix
@@ -67,25 +66,6 @@ def from_first(x: Array) -> Array:
     a facet that is far from the origin.
     """
     return np.asarray(x - x[:, :1])
-
-
-@cache
-def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
-    """Cell unknowns of a Lagrange element on each facet, in the order of the facet's own element.
-
-    Shape ``(facets, unknowns per facet)``; ``cell`` is the name of the cell type.
-    """
-    cell_type = getattr(basix.CellType, cell)
-    points = basix.create_element(basix.ElementFamily.P, cell_type, degree, variant).points
-    corners, topology = basix.geometry(cell_type), basix.topology(cell_type)
-    element = FacetElement(FACET_OF[cell], degree, variant)
-    hats = FacetElement(FACET_OF[cell], 1, variant)
-    table = []
-    for vertices in topology[points.shape[1] - 1]:
-        on_facet = hats.values(element.points) @ corners[vertices]
-        distance = np.linalg.norm(on_facet[:, None] - points[None], axis=2)
-        table.append(np.argmin(distance, axis=1))
-    return np.array(table)
 
 
 # --- Facets of contact surfaces ---------------------------------------------------------------
@@ -155,23 +135,35 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
     )
 
 
-def local_facets(dofs: TornDofs, facets: Array) -> Facets:
-    """Data of local facets of the true boundary, without averaged normals."""
-    mesh = dofs.V.mesh
-    cell_type, gdim, fdim = mesh.topology.cell_type, mesh.geometry.dim, mesh.topology.dim - 1
+def _cells_at(mesh: dmesh.Mesh, facets: Array) -> tuple[Array, Array]:
+    """Return the cells of local exterior facets, and their places there."""
+    fdim = mesh.topology.dim - 1
     mesh.topology.create_connectivity(fdim, fdim + 1)
     cells = mesh.topology.connectivity(fdim, fdim + 1)
     cell = cells.array[cells.offsets[facets]]
-    place = np.argmax(cell_facets(mesh)[cell] == facets[:, None], axis=1)
-    element = dofs.V.element.basix_element
+    return cell, np.argmax(cell_facets(mesh)[cell] == facets[:, None], axis=1)
+
+
+def facet_nodes(dofs: TornDofs, facets: Array) -> Array:
+    """Return the primal nodes of local exterior facets, vertices first, shape ``(n, t)``."""
+    cell, place = _cells_at(dofs.V.mesh, facets)
+    on_facet = np.array(dofs.V.element.basix_element.entity_closure_dofs[-2])[place]
+    nodes = np.take_along_axis(np.asarray(dofs.V.dofmap.list)[cell], on_facet, axis=1)
+    return dofs.primal_node[nodes]
+
+
+def local_facets(dofs: TornDofs, facets: Array) -> Facets:
+    """Data of local facets of the true boundary, without averaged normals."""
+    mesh, kind = dofs.V.mesh, facet_kind(dofs)
+    gdim, (cell, place) = mesh.geometry.dim, _cells_at(mesh, facets)
     coordinate = mesh.ufl_domain().ufl_coordinate_element()
-    on_facet = facet_dofs(cell_type.name, coordinate.degree, coordinate.lagrange_variant)[place]
+    of_cell = basix.create_element(
+        basix.ElementFamily.P, coordinate.cell_type, coordinate.degree, coordinate.lagrange_variant
+    )
+    on_facet = np.array(of_cell.entity_closure_dofs[-2])[place]
     nodes = geometry_dofmap(mesh)[cell]
     x = mesh.geometry.x[np.take_along_axis(nodes, on_facet, axis=1)][:, :, :gdim]
-    trace = facet_dofs(cell_type.name, element.degree, element.lagrange_variant)[place]
-    displacement = np.take_along_axis(np.asarray(dofs.V.dofmap.list)[cell], trace, axis=1)
-    kind = facet_kind(dofs)
-    inside = mesh.geometry.x[nodes[:, : coordinate.dim // gdim]].mean(axis=1)[:, :gdim]
+    inside = mesh.geometry.x[nodes].mean(axis=1)[:, :gdim]
     hats, corners = kind.hats, x[:, : kind.hats.size]
     (normal,) = _normals(hats, corners, hats.points.mean(axis=0)[None])
     area = (0.5 if kind.hats.facet == "triangle" else 1.0) * np.linalg.norm(normal, axis=1)
@@ -181,7 +173,7 @@ def local_facets(dofs: TornDofs, facets: Array) -> Facets:
     sign = np.sign(np.sum(at_vertices * normal, axis=2, keepdims=True))
     return Facets(
         x=np.ascontiguousarray(x),
-        groups=dofs.group[dofs.primal_node[displacement]],
+        groups=dofs.group[facet_nodes(dofs, facets)],
         normal=normal,
         vertex_normals=np.ascontiguousarray((sign * _unit(at_vertices)).swapaxes(0, 1)),
         area=area,
