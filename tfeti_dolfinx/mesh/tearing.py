@@ -25,14 +25,7 @@ from tfeti_dolfinx.mesh.partition import (
     given_subdomains,
     make_parts,
 )
-from tfeti_dolfinx.mesh.untorn import (
-    NO_TAG,
-    UntornMesh,
-    cell_facets,
-    equal_pairs,
-    exchange_by_key,
-    facet_keys,
-)
+from tfeti_dolfinx.mesh.untorn import NO_TAG, UntornMesh, cell_facets
 
 # --- Subdomains on ranks ----------------------------------------------------------------------
 
@@ -125,23 +118,27 @@ def decomposed(
     of_piece, split, body = connected_parts(pieces, absorb=number > 0)
     if split and comm.rank == 0:
         log.info("subdomains in several pieces have been split, which does no harm: %s", split)
-    return replace(
-        tear(untorn, of_piece[pieces.of_cell], comm), split=split, body_of_subdomain=body
-    )
+    return tear(untorn, graph, of_piece[pieces.of_cell], body, split)
 
 
-def tear(untorn: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Decomposition:
+def tear(
+    untorn: UntornMesh, graph: CellGraph, subdomain: Array, body: Array, split: dict[int, list[int]]
+) -> Decomposition:
     """Tear a mesh along the interfaces of its subdomains, each on one rank then. Collective.
 
-    These are connected, and numbered without holes.
+    These are connected, and numbered without holes. ``body`` is that of each, ``split`` as of a
+    ``Decomposition``.
     """
-    num = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
+    comm = graph.comm
     terms = np.column_stack((np.ones(len(subdomain)), untorn.midpoints()))
-    sums = summed(comm, sum_rows(subdomain, terms, num))
+    sums = summed(comm, sum_rows(subdomain, terms, len(body)))
     ranks = bcast_from_root(comm, deal(sums[:, 0], sums[:, 1:] / sums[:, :1], comm.size))
-    share, subdomain = moved(untorn, ranks[subdomain], subdomain, comm)
+    on_boundary = graph.across == np.arange(graph.num_cells)[:, None]
+    values = np.column_stack((subdomain, on_boundary))
+    share, values = moved(untorn, ranks[subdomain], values, comm)
+    subdomain, on_boundary = values[:, 0], values[:, 1:] > 0
     order = np.argsort(share.cell_ids)
-    small = subdomain[order].astype(np.min_scalar_type(num))  # sorted by counting
+    small = subdomain[order].astype(np.min_scalar_type(len(body)))  # sorted by counting
     order = order[np.argsort(small, kind="stable")]
     # nodes of the torn mesh: one copy for each subdomain
     stride = max(len(share.node_ids), 1)
@@ -152,9 +149,10 @@ def tear(untorn: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Decomposi
     cells = start + torn.reshape(share.cells.shape)
     mesh = create_mesh_in_place(comm, cells, share.x[node], share.element)
     cell = order[np.asarray(mesh.topology.original_cell_index) - offset_of(comm, len(cells))]
-    facets = cell_facets(mesh)
-    tears, boundary = _tears(mesh, facets, share, cell)
-    tdim = mesh.topology.dim
+    facets, tdim = cell_facets(mesh), mesh.topology.dim
+    boundary = np.sort(facets[on_boundary[cell]])
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    tears = np.setdiff1d(dmesh.exterior_facet_indices(mesh.topology), boundary)
     return Decomposition(
         mesh=mesh,
         cell_tags=_tagged(mesh, tdim, np.arange(len(cell)), share.cell_tags[cell], "cell_tags"),
@@ -163,10 +161,10 @@ def tear(untorn: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Decomposi
         cell_subdomain=subdomain[cell],
         original_cells=share.cell_ids[cell],
         original_nodes=share.node_ids[node][mesh.geometry.input_global_indices - start],
-        body_of_subdomain=np.zeros(num, dtype=np.int64),
+        body_of_subdomain=body,
         tears=tears,
         boundary=boundary,
-        split={},
+        split=split,
     )
 
 
@@ -178,25 +176,3 @@ def _tagged(mesh: dmesh.Mesh, dim: int, entities: Array, tags: Array, name: str)
     meshtags = dmesh.meshtags(mesh, dim, found.astype(np.int32), values)
     meshtags.name = name
     return meshtags
-
-
-def _tears(
-    mesh: dmesh.Mesh, facets_of_cells: Array, share: UntornMesh, cell: Array
-) -> tuple[Array, Array]:
-    """Facets on tears, and facets on the true boundary.
-
-    Keys of all exterior facets meet on the rank that the key names.
-    """
-    mesh.topology.create_connectivity(mesh.topology.dim - 1, mesh.topology.dim)
-    exterior = np.zeros(facets_of_cells.max(initial=-1) + 1, dtype=bool)
-    exterior[dmesh.exterior_facet_indices(mesh.topology)] = True
-    row, local = np.nonzero(exterior[facets_of_cells])
-    facets = facets_of_cells[row, local]
-    keys = facet_keys(share.cells[cell[row]], share.node_ids, share.cell_type)
-    keys = keys[np.arange(len(row)), local]
-    exchange = exchange_by_key(mesh.comm, keys)
-    met = exchange.send(keys)
-    torn = np.zeros(len(met), dtype=bool)
-    torn[np.concatenate(equal_pairs(met))] = True
-    is_tear = exchange.answer(torn)
-    return np.sort(facets[is_tear]), np.sort(facets[~is_tear])
