@@ -24,7 +24,7 @@ from tfeti_dolfinx.contact.records import (
 from tfeti_dolfinx.contact.rigid_body import rotation_vector
 from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mortar.facets import group_points, surface_facets, surface_nodes
+from tfeti_dolfinx.mortar.facets import facet_nodes, group_points, surface_facets
 from tfeti_dolfinx.qp.sets import Face
 
 # --- Status of contacts and rows --------------------------------------------------------------
@@ -246,7 +246,7 @@ class ContactState:
             given["surface"] = self.decomposition.surface(surface)
         facets = surface_facets(self.decomposition, surface)
         member = np.zeros(self.dofs.num_nodes, dtype=bool)
-        member[surface_nodes(self.dofs, facets)] = True
+        member[facet_nodes(self.dofs, facets)] = True
         groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or))
         # −Bᵀλ, summed over the copies of a node, less the contact forces: gluing forces cancel
         constraints = self.gluing.constraints

@@ -270,24 +270,21 @@ class Gluing:
     # Friction acts on what comes to it
     slip: Array
 
-    def right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Array:
-        """This rank's part of c for any prescribed values, gaps and slips; B stays. Collective.
+    def right_side(self) -> Array:
+        """Return this rank's part of c, shape ``(num_rows,)``. Collective.
 
-        Raise a NoSolutionError where prescribed components alone violate a condition. Values are of
-        owned groups, shape ``(g, bs)``, and have no effect on components that are not prescribed;
-        gaps, lengths, of the conditions; slips as the attribute, default that. Shape
-        ``(num_rows,)``.
+        Raise a NoSolutionError where prescribed components alone violate a condition.
         """
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
-        held = relative_motion(records, self.dofs, np.where(self.prescribed.flag, values, 0.0))
-        held -= records.motion
-        left = gaps - np.sum(records.normal * held, axis=1)
+        held = relative_motion(records, self.dofs, self.prescribed.value) - records.motion
+        left = records.gap - np.sum(records.normal * held, axis=1)
         self._check_decided(left[normals.decided])
         along = np.einsum("ntg,ng->nt", records.tangents, held)
-        slips = ((self.slip if slip is None else slip) - along)[tangents.condition]
+        slips = (self.slip - along)[tangents.condition]
         c = np.zeros(self.constraints.num_rows)
-        c[sets.equalities[self.held.row]] = values.ravel()[self.held.component] * self.held.factor
+        values = self.prescribed.value.ravel()[self.held.component]
+        c[sets.equalities[self.held.row]] = values * self.held.factor
         c[sets.normals] = left[normals.condition] * normals.scale
         c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
         return c
@@ -307,17 +304,20 @@ class Gluing:
     def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
         """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.
 
-        Arguments and errors are those of ``right_side``. The constraints are shared with these
-        rows: their c is the new one too. What raises leaves it as it was.
+        Values are of owned groups, shape ``(g, bs)``, and have no effect on components that are not
+        prescribed; gaps, lengths, of the conditions; slips as the attribute, default that. The
+        constraints are shared with these rows: their c is the new one too. What raises, as
+        ``right_side`` says, leaves it as it was.
         """
-        self.constraints.c[:] = self.right_side(values, gaps, slip)
         flag = self.prescribed.flag
-        return replace(
+        gluing = replace(
             self,
             prescribed=Prescribed(flag, np.where(flag, values, 0.0)),
             records=replace(self.records, gap=gaps),
             slip=self.slip if slip is None else slip,
         )
+        self.constraints.c[:] = gluing.right_side()
+        return gluing
 
     def with_supports_at(self, values: Array) -> Array:
         """Return this rank's part of c, but for supports, which hold the values, shape ``(g, bs)``.
@@ -409,7 +409,7 @@ def glue(
     slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
     gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)
     try:
-        constraints.c[:] = gluing.right_side(prescribed.value, records.gap)
+        constraints.c[:] = gluing.right_side()
     except TfetiError:  # on all ranks
         constraints.B.destroy()
         raise

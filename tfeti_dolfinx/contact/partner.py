@@ -78,7 +78,10 @@ class ContactPartner(ABC):
 
     def first_reach(self, decomposition: Decomposition) -> float:
         """Return the first reach; raise an InputError where it, surfaces or gap do not fit."""
-        facets = [surface_facets(decomposition, name) for name in self.surfaces]
+        try:
+            facets = [surface_facets(decomposition, name) for name in self.surfaces]
+        except InputError as error:  # on all ranks
+            raise InputError(f"{self.name}: {error}") from error
         self._check_gap()
         size, reach = min(extent(decomposition, surface) for surface in facets), self.reach
         if reach is None:
@@ -349,18 +352,14 @@ class Contact(ContactPartner):
 
     def first_reach(self, decomposition: Decomposition) -> float:
         """Return the reach to begin with, and check the surfaces. Collective."""
-        try:
-            for name in self.surfaces:
-                surface_facets(decomposition, name)
-        except InputError as error:  # on all ranks
-            raise InputError(f"{self.name}: {error}") from error
+        reach = super().first_reach(decomposition)
         if decomposition.surface(self.a) == decomposition.surface(self.b):
             raise InputError(
                 f"{self.name}: both are the same surface; contact of a surface with itself is "
                 "not supported, give its two sides different names"
             )
         self._named_first(decomposition)
-        return min(super().first_reach(decomposition), diameter(decomposition))
+        return min(reach, diameter(decomposition))
 
     def settled(
         self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None

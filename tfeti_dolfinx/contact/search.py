@@ -16,7 +16,7 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import diameter, surface_nodes
+from tfeti_dolfinx.mortar.facets import diameter, facet_nodes
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 log = logging.getLogger(__name__)
@@ -194,7 +194,8 @@ class ContactSearch:
         dofs, cut, comm = self._dofs, self._dofs.decomposition, self._dofs.comm
         if len(contact.surfaces) == 1:
             return 0.0
-        moved = [u[surface_nodes(dofs, cut.facets(name))] for name in contact.surfaces]
+        nodes = (np.unique(facet_nodes(dofs, cut.facets(name))) for name in contact.surfaces)
+        moved = [u[at] for at in nodes]
         own = np.sum([np.append(part.sum(axis=0), len(part)) for part in moved], axis=0)
         *total, count = summed(comm, own)
         squares = [np.sum((u - np.divide(total, count)) ** 2, axis=1) for u in moved]

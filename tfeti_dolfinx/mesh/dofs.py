@@ -149,9 +149,7 @@ class TornDofs:
 
     def to_dolfinx(self, values: Array) -> Array:
         """Unrolled dof values from primal order to DOLFINx's order, shape ``(n * bs,)``."""
-        out = np.empty((self.num_nodes, self.bs))
-        out[self.dolfinx_node] = values.reshape(-1, self.bs)
-        return out.ravel()
+        return values.reshape(-1, self.bs)[self.primal_node].ravel()
 
     def dolfinx_dofs(self) -> Array:
         """DOLFINx's unrolled dof for each primal dof, shape ``(n * bs,)``."""

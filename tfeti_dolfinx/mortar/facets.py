@@ -321,13 +321,6 @@ def hat_integrals(dofs: TornDofs, names: Sequence[str | int], thickness: Any = 1
     return dofs.reduce(per_node, np.add)
 
 
-def surface_nodes(dofs: TornDofs, facets: Array) -> Array:
-    """Primal nodes of local facets."""
-    fdim = dofs.V.mesh.topology.dim - 1
-    nodes = fem.locate_dofs_topological(dofs.V, fdim, facets.astype(np.int32), remote=False)
-    return dofs.primal_node[nodes]
-
-
 def group_points(dofs: TornDofs) -> Array:
     """Return coordinates of the owned groups, shape ``(g, 3)``. Collective."""
     return dofs.reduce(dofs.points(), np.minimum)
