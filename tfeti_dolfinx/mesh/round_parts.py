@@ -1,4 +1,4 @@
-"""Round parts of a distributed mesh by balanced k-means."""
+"""Round parts of a distributed mesh: balanced k-means, then smooth interfaces."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sum_rows
-from tfeti_dolfinx.common.parallel import box_over_ranks, summed
+from tfeti_dolfinx.common.parallel import any_rank, box_over_ranks, summed
 from tfeti_dolfinx.mesh.bisection import PARAMETERS as BISECTION
 from tfeti_dolfinx.mesh.bisection import bisect_points, sizes_of
-from tfeti_dolfinx.mesh.cell_graph import CellGraph
+from tfeti_dolfinx.mesh.cell_graph import CellGraph, incidence
 from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
 
 
@@ -32,9 +33,12 @@ class RoundParameters:
     # of the distance to the next centre, which a part's influence is at most
     influence: float = 0.8
     fewest: int = 20  # cells of a part in the mean, below which parts are those of bisection
-    # sizes over the mean between which parts are balanced
-    smallest: float = 0.93
-    largest: float = 1.08
+    # weight of a facet over that of a vertex that a cell shares with another part
+    facet: float = 12.0
+    flattening: int = 10  # rounds in which cells change sides, until interfaces are flat
+    # size over the mean, above which a part gains no cells where interfaces are flattened
+    gains: float = 1.08
+    loses: float = 0.93  # and below which it loses none; between the two sizes are balanced
     bits: int = 20  # of the whole numbers that midpoints become along each axis
 
 
@@ -42,7 +46,7 @@ ROUND = RoundParameters()
 
 
 def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
-    """Part of each cell, by balanced k-means. Collective.
+    """Part of each cell, by balanced k-means with smooth interfaces. Collective.
 
     Each body gets a share of the parts by its number of cells, and at least one. Bodies of flat
     cells, and of few cells a part, get parts by bisection, whose cuts follow layers. Some parts may
@@ -73,7 +77,7 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     if np.any(boxes):
         some = boxes[body]
         part[some] = bisect_points(x[some], shares, comm, extents[some], body=body[some])
-    return part
+    return flatten_interfaces(graph, part, key, np.where(boxes, 0.0, sizes / shares)[home])
 
 
 def _shares(weights: Array, num_parts: int) -> Array:
@@ -125,7 +129,7 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
             size = np.maximum(sizes_of(own, len(home), comm), 1)
             if way:
                 centre += way * (_means(y, own, centre, comm) - centre)
-            elif np.all((size < ROUND.largest * goal) & (size > ROUND.smallest * goal)):
+            elif np.all((size < ROUND.gains * goal) & (size > ROUND.loses * goal)):
                 break
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
@@ -175,3 +179,70 @@ def _nearest(x: Array, part: Array, centre: Array, influence: Array, home: Array
         squares = _squares(x[own][:, None], centre[joined])
         found[own] = joined[np.argmin(squares / influence[joined] ** 2, axis=1)]
     return found
+
+
+# --- Smoothing of interfaces between parts ----------------------------------------------------
+
+
+def flatten_interfaces(graph: CellGraph, part: Array, key: Array, wanted: Array) -> Array:
+    """Move cells to the neighbouring part that most of their surroundings belong to. Collective.
+
+    Of each part count the cells that share a vertex with a cell, once for each such vertex, and
+    those that share a facet with it twelve times more. A cell that counts more of a neighbour's
+    part than of its own joins it, which takes off what sticks out of an interface. Some of the new
+    parts may no longer be connected through facets. ``wanted`` is the number of cells that each
+    part should have, 0 where it stays as it is; the keys of the cells, ``(n,)``, draw lots.
+    """
+    n, num_parts, comm = graph.num_cells, len(wanted), graph.comm
+    around = incidence(graph.vertices, graph.num_nodes + 1).T.tocsr()
+    every = graph.with_ghosts(part.astype(np.int32))
+    near: Array = np.arange(n)
+    for turn in range(ROUND.flattening):
+        near = near[np.any(every[graph.across[near]] != every[near, None], axis=1)]
+        own = every[near]
+        mine, most, best = _majority(every, graph.vertices[near], around, near, graph.across[near])
+        wants = (most > mine) & (wanted[own] > 0)
+        if not any_rank(comm, wants):
+            break
+        # half of those that want to move, so that neighbours do not just exchange their parts
+        lot = mix(key[near] + np.uint64(turn)) & np.uint64(1)
+        size = sizes_of(every[:n], num_parts, comm) / np.maximum(wanted, 1.0)
+        moving = wants & (lot == 0)
+        moving &= (size[best] < ROUND.gains) & (size[own] > ROUND.loses)
+        part = every[:n].copy()
+        part[near[moving]] = best[moving]
+        now = graph.with_ghosts(part)
+        touched = np.zeros(graph.num_nodes + 1, dtype=bool)
+        touched[graph.vertices[now != every]] = True
+        touched[-1] = False
+        active = np.zeros(len(every), dtype=bool)
+        active[around[np.flatnonzero(touched)].indices] = True
+        active[near[wants]] = True
+        near, every = np.flatnonzero(active[:n]), now
+    return every[:n]
+
+
+def _majority(
+    every: Array, corners: Array, around: csr_array, cell: Array, across: Array
+) -> tuple[Array, Array, Array]:
+    """Return of each cell its own part's count, and of the others' the highest and its part.
+
+    ``around`` has the cells at each node, ``across`` those across a facet of each of these cells.
+    """
+    num_parts, own = int(every.max(initial=0)) + 1, every[cell]
+    nodes, place = np.unique(corners, return_inverse=True)
+    met = around[nodes]
+    met = csr_array((met.data, every[met.indices], met.indptr), shape=(len(nodes), num_parts))
+    facets = incidence(every[np.column_stack((cell, across))], num_parts)
+    facets.data[:] = np.column_stack((np.ones(len(cell)), across != cell[:, None])).ravel()
+    facets.sum_duplicates()
+    counted = incidence(place.reshape(corners.shape), len(nodes)) @ met
+    counted = csr_array(counted.multiply(facets > 0) + ROUND.facet * facets)
+    counted.sort_indices()
+    is_own = counted.indices == np.repeat(own, np.diff(counted.indptr))
+    mine, start = counted.data[is_own] - ROUND.facet, counted.indptr[:-1]
+    counted.data[is_own] = 0.0
+    most = np.maximum.reduceat(counted.data, start) if len(own) else mine
+    less = counted.data < np.repeat(most, np.diff(counted.indptr))
+    part = np.where(less, num_parts, counted.indices)  # of equal ones the first
+    return mine, most, np.minimum.reduceat(part, start) if len(own) else own
