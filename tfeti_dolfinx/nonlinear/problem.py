@@ -112,8 +112,13 @@ class NonlinearContactProblem(ContactProblem):
                 checked_callable(update, "update", "a function without arguments")
             if finite and J is not None:
                 raise InputError("finite=True: expected no J, since the tangent is made from F")
+            for contact in checked_contacts(contacts) if finite else ():
+                if not isinstance(contact.gap, str):
+                    raise InputError(
+                        f"{contact.name}: a given gap with finite=True; "
+                        'expected gap="geometry" or "curved"'
+                    )
             if finite:
-                check_gaps(contacts)
                 J = rotation_free_tangent(F, u)
             elif J is None:
                 J = ufl.derivative(F, u)
@@ -451,12 +456,3 @@ class NonlinearContactProblem(ContactProblem):
     def _return(self) -> None:
         super()._return()
         self._set(self.u.x.array)
-
-
-def check_gaps(contacts: Sequence[ContactPartner]) -> None:
-    """Raise if a contact in finite strain has a given gap, which no place would change."""
-    for contact in checked_contacts(contacts):
-        if not isinstance(contact.gap, str):
-            raise InputError(
-                f'{contact.name}: a given gap with finite=True; expected gap="geometry" or "curved"'
-            )

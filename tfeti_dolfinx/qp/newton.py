@@ -132,8 +132,20 @@ def feasible_start(qp: QP, start: Start) -> Array:
     for within in (WithinFace(qp.feasible, qp.feasible.face(on, -on)), qp.feasible):
         found, _ = project_onto_feasible(qp.coarse, within, start.lam)
         if imbalance(qp.coarse, found) <= UNBALANCED:
-            return found
+            return _multiple(qp, start.lam, found)
     return first_point(qp)
+
+
+def _multiple(qp: QP, lam: Array, nearest: Array) -> Array:
+    """Return cλ, whose image is known, if it is feasible and about as near to λ as the nearest.
+
+    It is where a load grows; else return that. Collective.
+    """
+    coarse, held = qp.coarse, qp.coarse.G(lam)
+    grown = float(held @ coarse.e) / max(float(held @ held), TINY) * lam
+    way, shortest = qp.dot((grown - lam, grown - lam), (nearest - lam, nearest - lam))
+    leaves = any_rank(coarse.comm, qp.feasible.project(grown) != grown)
+    return nearest if way > 4.0 * shortest or leaves or imbalance(coarse, grown) > HELD else grown
 
 
 def multipliers_at(qp: QP, z: Point) -> Array:

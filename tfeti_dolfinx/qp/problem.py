@@ -196,9 +196,16 @@ class LastProduct:
         self.d, self.e = qp.d, np.array(qp.coarse.e)
 
     def known(self, comm: MPI.Intracomm, x: Array) -> Array:
-        """Return this rank's Fx, or an empty array if x is not the last solution. Collective."""
-        found = not any_rank(comm, not np.array_equal(self.x, x))
-        return np.array(self.Fx) if found else np.zeros(0)
+        """Return this rank's Fx, or an empty array if x is no multiple of the last solution.
+
+        Collective.
+        """
+        if any_rank(comm, self.x.shape != x.shape):
+            return np.zeros(0)
+        square, along = dot_over(comm, (self.x, self.x), (self.x, x))
+        c = along / square if square else 1.0
+        found = norm_over(comm, x - c * self.x) <= ROUNDING * norm_over(comm, x)
+        return c * self.Fx if found else np.zeros(0)
 
     def take(self, comm: MPI.Intracomm, x: Array, Fx: Array) -> None:
         """Restore what ``known`` has returned in another run. Collective."""
