@@ -23,7 +23,12 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.projection import UNBALANCED, WithinFace, project_onto_feasible
+from tfeti_dolfinx.qp.projection import (
+    UNBALANCED,
+    ProjectionParameters,
+    WithinFace,
+    project_onto_feasible,
+)
 from tfeti_dolfinx.qp.sets import Face, Status
 
 # least status of rows with friction
@@ -97,28 +102,28 @@ def first_point(qp: QP) -> Array:
     return _on_foundation(qp)
 
 
-def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1) -> Array:
+def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1, roughly: float = 1e-3) -> Array:
     """Return forces of rigid bodies on springs that balance the load: which rows touch first.
 
     It is the feasible point nearest to the forces of springs that gaps press. How many rows carry
     depends on how soft springs are, and that on how many carry: found by at most ``max_it`` turns,
-    until these numbers differ by no more than the share ``alike``. Where the least λ of Ω does not
-    balance the load, it is that. Each projection begins where the one before has ended, the first
-    at the least λ of all. Collective.
+    which balance the load up to the share ``roughly``, until these numbers differ by no more than
+    the share ``alike``. Where the least λ of Ω does not balance the load, it is that. Each
+    projection begins where the one before has ended, the first at the least λ of all. Collective.
     """
     zero, whole = np.zeros(len(qp.d)), qp.coarse.solve(qp.coarse.e)
     lightest, alpha = project_onto_feasible(qp.coarse, qp.feasible, zero, whole)
     if qp.foundation is None or imbalance(qp.coarse, lightest) > UNBALANCED:
         return lightest
-    count, lam = 1, lightest
+    count, turn = 1, ProjectionParameters(balanced=roughly)
     for _ in range(max_it):
-        lam, alpha = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count), alpha)
+        springs, before = qp.foundation(count), count
+        lam, alpha = project_onto_feasible(qp.coarse, qp.feasible, springs, alpha, turn)
         touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
-        before = count
         count = max(int(summed(qp.coarse.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
         if abs(count - before) <= alike * before:
             break
-    return lam
+    return project_onto_feasible(qp.coarse, qp.feasible, springs, alpha)[0]
 
 
 def feasible_start(qp: QP, start: Start) -> Array:
