@@ -29,6 +29,9 @@ class NewtonTolerances:
             the last one: the slope along one step does not see all that is left.
         flattest: And at most this: at that of a kept tangent a new one would be solved to more
             than it moves.
+        near: In small strain a linearised problem that comes within so many times ``rtol`` is the
+            last but one, as a rule.
+        last: It is solved to so many times ``rtol``, which leaves little to the last one.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
@@ -63,6 +66,8 @@ class NewtonTolerances:
     loosest: float | None = None
     steepest: float = 0.1
     flattest: float = 0.25
+    near: float = 20.0
+    last: float = 2.0
     nothing: float = 1e-12
     nowhere: float = 1e-13
     curvature: float = 0.5

@@ -188,6 +188,8 @@ class NonlinearContactProblem(ContactProblem):
             u = np.array(self.u.x.array)
             # 1. model
             rtol = float(np.clip(self._forcing * asked, exact, self._loosest))
+            if not self._finite and rtol < tol.near * exact:
+                rtol = min(rtol, tol.last * exact)
             try:
                 self._solve_linearised(rtol, warns=step == 0 or rtol <= exact)
             except InputError as error:  # that of an iterate, not of what was given
