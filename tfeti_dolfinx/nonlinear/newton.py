@@ -26,7 +26,7 @@ class NewtonTolerances:
         loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
             0.01.
         steepest: In small strain forcing expects the next increment to be at least this share of
-            the last one: the slope along one step does not see all that is left.
+            the last one: the slope along one step does not see all that is left. Nor does the end.
         flattest: And at most this: at that of a kept tangent a new one would be solved to more
             than it moves.
         near: In small strain a linearised problem that comes within so many times ``rtol`` is the

@@ -54,7 +54,7 @@ class NonlinearContactProblem(ContactProblem):
        gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0) is the remainder.
     3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with a new model
        of where the bodies are, or the last digit of that; in small strain where the remainder
-       times ‖d‖ is, which the next one is expected to be.
+       times ‖d‖ is, which the next one is expected to be, and a tenth of ‖d‖.
     4. *Step.* u ← u + t d; whole steps in finite strain, where J is not the derivative of F, and
        where J is kept, are accelerated by Anderson's method. It begins anew at a shortened step.
 
@@ -205,12 +205,13 @@ class NonlinearContactProblem(ContactProblem):
             increment = size / max(largest(comm, end), TINY) if size > self._last_digit else 0.0
             # 2. line search
             t, remainder = self._line_search(u, d)
-            expected = asked = min(remainder, 1.0) * increment
+            asked = min(remainder, 1.0) * increment  # what the next one is expected to be
             # 3. end
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
                 asked = float(np.clip(remainder, tol.steepest, tol.flattest)) * increment
-                short |= t == 1.0 and tol.safety * expected <= exact
+                left = max(tol.safety * remainder, tol.steepest) * increment
+                short |= t == 1.0 and left <= exact
             nothing = largest(comm, end) <= max(tol.nothing * first, self._least)
             if nothing or (short and rtol <= exact):
                 self._set(end)
