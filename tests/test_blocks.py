@@ -9,7 +9,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 from scenes import clamp, decomposed, forms, hooke, problem, strain
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, diags_array, tril
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import as_petsc_matrix
@@ -21,21 +21,30 @@ from tfeti_dolfinx.subdomains.block import SubdomainData, candidate_modes, kerne
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
-from tfeti_dolfinx.testing import check_block, check_kind_of_block
+from tfeti_dolfinx.testing import check_block
 
 RIGID = {"triangle": 3, "quadrilateral": 3, "tetrahedron": 6, "hexahedron": 6}
 
 
-def stiffness(cell, n=2, degree=1, mass=0.0, scalar=False):
+ENERGIES = {
+    "elastic": lambda u, v: ufl.inner(hooke()(u), strain(v)) * ufl.dx,
+    "scalar": lambda u, v: ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx,
+    "div-div": lambda u, v: ufl.div(u) * ufl.div(v) * ufl.dx,
+    "one point": lambda u, v: (
+        ufl.inner(hooke()(u), strain(v)) * ufl.dx(metadata={"quadrature_degree": 0})
+    ),
+    "deviator": lambda u, v: ufl.inner(ufl.dev(strain(u)), strain(v)) * ufl.dx,
+}
+
+
+def stiffness(cell, n=2, degree=1, mass=0.0, energy="elastic", length=1.0):
     """K and points of a box on one rank."""
     d = decomposed(cell, n, 1, comm=MPI.COMM_SELF)
+    d.mesh.geometry.x[:, 0] *= length
     gdim = d.mesh.geometry.dim
-    V = fem.functionspace(d.mesh, ("Lagrange", degree, () if scalar else (gdim,)))
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, () if energy == "scalar" else (gdim,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    if scalar:
-        a = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
-    else:
-        a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
+    a = ENERGIES[energy](u, v)
     if mass:
         a += mass * ufl.inner(u, v) * ufl.dx
     return csr_array(assemble_csr(fem.form(a))), V.tabulate_dof_coordinates()[:, :gdim]
@@ -61,16 +70,13 @@ def block(K, x, every=3, how=None, **changes):
 @pytest.mark.parametrize(("what", "left"), [("scalar", 1), ("mass", 0), ("spring", 3)])
 def test_the_kernel_is_what_the_form_leaves_free(what, left):
     """A spring along z leaves two translations and a turn."""
-    K, x = stiffness("hexahedron", 2, mass=1e-6 * (what == "mass"), scalar=what == "scalar")
+    energy = what if what in ENERGIES else "elastic"
+    K, x = stiffness("hexahedron", mass=1e-6 * (what == "mass"), energy=energy)
     if what == "spring":
         K = csr_array(K + diags_array(np.tile([0.0, 0.0, 1e-3], len(x))))
     b = block(K, x)
     check_block(b, K)
     assert b.kernel.shape[1] == left
-
-
-def test_any_class_of_blocks_can_be_checked():
-    check_kind_of_block(SparseBlock)
 
 
 def test_factors_are_made_when_they_are_needed_and_kept():
@@ -94,14 +100,10 @@ def infinite(K):
     return csr_array((np.full_like(K.data, np.inf), K.indices, K.indptr), shape=K.shape)
 
 
-def crooked(K):
-    return csr_array(K + csr_array(([1.0], ([0], [1])), shape=K.shape))
-
-
 @pytest.mark.parametrize(
     ("change", "load", "message"),
     [
-        (crooked, 0.0, "the stiffness is not symmetric"),
+        (lambda K: csr_array(tril(K)), 0.0, "the stiffness is not symmetric"),
         (infinite, 0.0, "the stiffness has entries that are not"),
         (lambda K: csr_array(-K), 0.0, ".* diagonal entry -"),
         (lambda K: K, np.nan, "the load has 1 entries not finite"),
@@ -131,25 +133,14 @@ def test_a_negative_energy_is_told_from_none(share, message):
         block(csr_array(K - change), x)
 
 
-ENERGIES = {
-    "div-div": lambda u, v: ufl.div(u) * ufl.div(v) * ufl.dx,
-    "one point": lambda u, v: (
-        ufl.inner(hooke()(u), strain(v)) * ufl.dx(metadata={"quadrature_degree": 0})
-    ),
-    "deviator": lambda u, v: ufl.inner(ufl.dev(strain(u)), strain(v)) * ufl.dx,
-}
 WITHOUT = [("triangle", "div-div"), ("quadrilateral", "one point"), ("hexahedron", "deviator")]
 
 
 @pytest.mark.parametrize(("cell", "energy"), WITHOUT)
 def test_motions_without_energy_are_named(cell, energy):
     """Rounding alone decides whether a factor is made."""
-    d = decomposed(cell, 2, 1, comm=MPI.COMM_SELF)
-    gdim = d.mesh.geometry.dim
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
-    form = ENERGIES[energy](ufl.TrialFunction(V), ufl.TestFunction(V))
-    K, x = csr_array(assemble_csr(fem.form(form))), V.tabulate_dof_coordinates()[:, :gdim]
-    rigid = kernel_of(K, candidate_modes(x, gdim, x.mean(axis=0), 1.0)).shape[1]
+    K, x = stiffness(cell, energy=energy)
+    rigid = kernel_of(K, candidate_modes(x, x.shape[1], x.mean(axis=0), 1.0)).shape[1]
     with pytest.raises(InputError, match=f"gives no energy to motions besides the {rigid} of"):
         block(K, x)
 
@@ -206,8 +197,7 @@ def test_a_solver_that_is_missing_is_named():
 
 
 def test_a_value_that_petsc_cannot_read():
-    says = r"PETSc, with options -tfeti_sub_\.\.\., failed: .* abc has no numeric value"
-    with pytest.raises(FactorError, match=says):
+    with pytest.raises(FactorError, match=r"-tfeti_sub_\.\.\., .* abc has no numeric value"):
         problem(decomposed("triangle"), tfeti_sub_pc_factor_fill="abc").solve()
 
 
@@ -254,11 +244,5 @@ def test_an_implementation_that_breaks_its_promises_is_named():
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_flat_cells_are_not_taken_for_a_form_without_energy(cell):
     """Their softest deformations are as free as those of a wrong form, and lost by rounding."""
-    d = decomposed(cell, 2, 1, comm=MPI.COMM_SELF)
-    d.mesh.geometry.x[:, 0] *= 1e9
-    V, a, _ = forms(d.mesh, d.facet_tags, np.zeros(d.mesh.geometry.dim), d.surface("top"))
     with pytest.raises(InputError, match="indefinite by rounding"):
-        block(
-            csr_array(assemble_csr(fem.form(a))),
-            V.tabulate_dof_coordinates()[:, : d.mesh.geometry.dim],
-        )
+        block(*stiffness(cell, length=1e9))

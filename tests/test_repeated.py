@@ -82,6 +82,15 @@ def scene(request):
     made.problem.destroy()
 
 
+@pytest.fixture
+def pair():
+    """Two scenes, lumped: a preconditioner of Dirichlet factors interiors of another trace."""
+    made = [Repeated("triangle", pc_type="lumped") for _ in range(2)]
+    yield made
+    for item in made:
+        item.problem.destroy()
+
+
 def test_the_same_load_again_costs_next_to_nothing(scene):
     first = scene.solve()
     before, lam = first.u.copy(), first.lam.copy()
@@ -133,7 +142,7 @@ def counted(solve):
 @pytest.mark.parametrize(("cell", "most"), [("triangle", 100), ("hexahedron", 150)])
 def test_a_solve_with_friction_makes_few_sparse_matrices(cell, most):
     scene = Repeated(cell, parts=8, friction=tfeti.Coulomb(0.3))
-    assert counted(scene.solve)[1] <= most
+    assert max(scene.problem.decomposition.comm.allgather(counted(scene.solve)[1])) <= most
     scene.problem.destroy()
 
 
@@ -187,9 +196,8 @@ def test_another_gap_makes_no_row():
         item.problem.destroy()
 
 
-def test_other_forms_and_conditions():
-    # a lumped preconditioner: that of Dirichlet factors the interiors of another trace
-    scene, other = (Repeated("triangle", pc_type="lumped") for _ in range(2))
+def test_other_forms_and_conditions(pair):
+    scene, other = pair
     first = scene.solve()
     d, V = scene.problem.decomposition, scene.problem.dofs.V
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -206,8 +214,6 @@ def test_other_forms_and_conditions():
     assert scene.problem.report.factorizations == 0
     assert scene.problem.report.searches == 0
     assert distance(mirrored, first) > 1e-2
-    for item in (scene, other):
-        item.problem.destroy()
 
 
 @pytest.mark.parametrize("change", [{"E": 3.0}, {}])
@@ -240,9 +246,8 @@ def test_factors_that_failed_are_made_again():
     scene.problem.destroy()
 
 
-def test_a_mesh_that_has_moved_is_searched_again():
-    # a lumped preconditioner: that of Dirichlet factors the interiors of another trace
-    scene, other = (Repeated("triangle", pc_type="lumped") for _ in range(2))
+def test_a_mesh_that_has_moved_is_searched_again(pair):
+    scene, other = pair
     first = scene.solve()
     for item in (scene, other):
         item.problem.decomposition.mesh.geometry.x[:, 1] -= 0.015
@@ -250,8 +255,6 @@ def test_a_mesh_that_has_moved_is_searched_again():
     assert scene.problem.report.searches == 1
     assert distance(second, other.solve()) <= 1e-8
     assert distance(second, first) > 1e-2
-    for item in (scene, other):
-        item.problem.destroy()
 
 
 def test_the_stress_of_an_earlier_solution_is_that_of_its_modulus():
@@ -264,11 +267,8 @@ def test_the_stress_of_an_earlier_solution_is_that_of_its_modulus():
     problem = compressed(d, elastic, contacts=[floor], sides=("left",), rtol=1e-10)
 
     def fields(solution):
-        return [
-            solution.stress.x.array,
-            solution.nodal_von_mises.x.array,
-            solution.pressure.x.array,
-        ]
+        of = solution.stress, solution.nodal_von_mises, solution.pressure
+        return [field.x.array for field in of]
 
     first = problem.solution
     problem.solve()
@@ -281,9 +281,8 @@ def test_the_stress_of_an_earlier_solution_is_that_of_its_modulus():
     problem.destroy()
 
 
-def test_an_update_that_raises_has_changed_nothing():
-    # a lumped preconditioner: that of Dirichlet factors the interiors of another trace
-    scene, other = (Repeated("triangle", pc_type="lumped") for _ in range(2))
+def test_an_update_that_raises_has_changed_nothing(pair):
+    scene, other = pair
     first = scene.solve()
     V = scene.problem.dofs.V
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -299,8 +298,6 @@ def test_an_update_that_raises_has_changed_nothing():
             scene.problem.update(**{**good, name: value})
         assert distance(scene.solve(), first) <= 1e-8
         assert counters(scene.problem.report) == [0] * len(COUNTERS)
-    for item in (scene, other):
-        item.problem.destroy()
 
 
 def test_coefficients_that_become_zero_leave_no_friction():

@@ -214,7 +214,6 @@ class Outcome:
     sticking: int = 0  # nodes with friction that touch and stick
     sliding: int = 0  # those that slip
     recycled_directions: int = 0  # that the next solve begins with
-    friction_last: int = 0  # multiplications by F of the last problem with given bounds
     # of F and preconditioner: subdomains in each form, seconds of a multiplication
     local_operators: dict[str, float] = field(default_factory=dict)
     converged_reason: str = "NOT_SOLVED"  # a ConvergedReason, or NO_SOLUTION
@@ -257,7 +256,6 @@ class Outcome:
             sticking=sticking,
             sliding=sliding,
             recycled_directions=0 if dual.recycled is None else dual.recycled.count,
-            friction_last=settling.last,
             local_operators=_local_operators(dual),
             converged_reason=result.reason.name,
             peak_memory_mb=kilobytes / 1024.0,

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
-from scipy.sparse import coo_array
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import Exchange, owner_of, summed
@@ -207,12 +206,11 @@ def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
     """Return triplets on the ranks that own their rows (as local slots), equal ones added up."""
     row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, row))
-    place = exchange.send(row) - dofs.group_offsets[dofs.comm.rank], exchange.send(column)
-    shape = dofs.num_groups, int(dofs.group_offsets[-1])
-    sums = coo_array((exchange.send(value), place), shape=shape).tocsr()
-    sums.sum_duplicates()
-    row = np.repeat(np.arange(dofs.num_groups), np.diff(sums.indptr))
-    return row, sums.indices.astype(np.int64), sums.data
+    total = dofs.group_offsets[-1]
+    row, column = exchange.send(row) - dofs.group_offsets[dofs.comm.rank], exchange.send(column)
+    place, which = np.unique(total * row + column, return_inverse=True)
+    sums = np.bincount(which, exchange.send(value), minlength=len(place))
+    return *np.divmod(place, total), sums
 
 
 # --- Forces on nodes, surfaces and bodies -----------------------------------------------------

@@ -66,7 +66,6 @@ class FixedPointStatus:
     iterations: int = 0  # problems with given bounds that were solved; 0 without Coulomb's law
     change: float = 0.0  # last change of the bounds, over their size
     tolerance: float = 0.0  # what that had to come down to
-    last: int = 0  # multiplications by F of the last problem
     # the body on which they changed most at last, or that slides; -1 without Coulomb's law
     body: int = -1
     newton_steps: int = 0  # steps of Newton's method on Coulomb's law, beside the problems
@@ -106,7 +105,7 @@ def solve_with_friction(
         if law is None:
             rtol = least if near else max(least, min(rtol, parameters.share * change))
         asked = rtol if law is None else least
-        before, exact = dual.F.count["solver"], goal if asked <= least else None
+        exact = goal if asked <= least else None
         result, rule = solve_dual(dual, options, qp_type, law or start, monitor, exact, rtol=asked)
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         if result.reason <= 0:
@@ -143,8 +142,7 @@ def solve_with_friction(
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
     result.steps, rule.looks = steps, looks
-    last = dual.F.count["solver"] - before
-    how = (float(change), tolerance, last, bounds.body, newton.steps, not holds)
+    how = (float(change), tolerance, bounds.body, newton.steps, not holds)
     return result, rule, FixedPointStatus(iterations, *how)
 
 
