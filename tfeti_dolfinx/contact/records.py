@@ -209,8 +209,7 @@ def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
     total = dofs.group_offsets[-1]
     row, column = exchange.send(row) - dofs.group_offsets[dofs.comm.rank], exchange.send(column)
     place, which = np.unique(total * row + column, return_inverse=True)
-    sums = np.bincount(which, exchange.send(value), minlength=len(place))
-    return *np.divmod(place, total), sums
+    return *np.divmod(place, total), sum_rows(which, exchange.send(value), len(place))
 
 
 # --- Forces on nodes, surfaces and bodies -----------------------------------------------------

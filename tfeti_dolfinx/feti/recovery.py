@@ -104,10 +104,10 @@ def nearest(coarse: CoarseSpace, state: Recovered, rest: Array, nothing: float =
         allowed = np.maximum(gap[at], 0.0) / closing[at]
         share = least(coarse.comm, float(allowed.min(initial=1.0)))
         u, gap = u + share * coarse.kernel_motion(alpha), gap - share * closing
-        held = np.array(held)
-        held[at[allowed <= share]] = share < 1.0
         if share == 1.0:
             return u
+        held = np.array(held)
+        held[at[allowed <= share]] = True
 
 
 def elastic_displacement(
