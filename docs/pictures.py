@@ -1,8 +1,11 @@
-"""Draw the pictures of the examples anew, at their default sizes.
+"""Draw the pictures of the documents anew.
 
     ./run python3 docs/pictures.py [NAME ...]
 
-Of what a demo draws those are taken that are in docs/pictures; a new one is put there by hand.
+A name is that of a demo, or of a picture of a benchmark; without one all are drawn, which takes an
+hour or more. Demos draw at their default sizes; of what they draw those pictures are taken that are
+in docs/pictures, so a new one is put there by hand. Benchmarks put their tables into the pages,
+too. peers.png needs the other programs: benchmarks/peers/compare.py draws it.
 """
 
 import shutil
@@ -12,19 +15,40 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 ROOT = Path(__file__).resolve().parents[1]
+PICTURES = ROOT / "docs/pictures"
+SIZES = {"talk_hertz_2d": ["--subdomains", "32"]}
+# of a benchmark, its name and arguments
+BENCHMARKS = {
+    "kplus_forms": ["kplus_forms"],
+    "performance_price": ["linear_price"],
+    "performance_talk": ["talk_tables"],
+    "performance_weak": ["scaling", "weak"],
+    "spectrum": ["spectrum"],
+    "time_against_error": ["time_against_error"],
+}
+
+
+def commit() -> str:
+    """Return the commit that is measured."""
+    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def main(names: list[str]) -> None:
-    """Run demos, all by default, and replace their pictures."""
-    for path in sorted((ROOT / "demos").glob("[a-z]*.py")):
-        if names and path.stem not in names:
-            continue
+    """Run demos and benchmarks, all by default, and replace their pictures."""
+    demos = {path.stem: path for path in sorted((ROOT / "demos").glob("[a-z]*.py"))}
+    for name in names or [*demos, *BENCHMARKS]:
+        program, *given = BENCHMARKS.get(name, [name, "--plot", *SIZES.get(name, [])])
+        if name in BENCHMARKS:
+            given += ["--document", commit()]
         with TemporaryDirectory() as folder:
-            command = [sys.executable, path, "--plot", "--output", folder]
+            path = demos.get(name, ROOT / f"benchmarks/{program}.py")
+            command = [sys.executable, path, *given, "--output", folder]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-            for known in (ROOT / "docs/pictures").glob(f"{path.stem}*"):
-                if (Path(folder) / known.name).exists():
-                    shutil.copy(Path(folder) / known.name, known)
+            for drawn in sorted(Path(folder).glob(f"{program}*.[gp][in][fg]")):
+                known = PICTURES / (f"{name}.png" if name in BENCHMARKS else drawn.name)
+                if known.exists():
+                    shutil.copy(drawn, known)
                     print(known.name, flush=True)
 
 

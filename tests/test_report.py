@@ -55,7 +55,7 @@ def test_the_first_screen_is_short(report):
     lines = str(report).splitlines()
     assert len(lines) <= 11
     assert lines[0] == "tfeti_dolfinx: CONVERGED_RTOL"
-    (contact,) = report.contacts
+    contact = report.contact(report.contacts[0].name)
     assert (contact.nodes, contact.touching) == (49, report.active_contacts)
     assert contact.resultant[2] > 0.0
     assert contact.pressure > 0.0

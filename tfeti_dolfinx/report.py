@@ -21,6 +21,7 @@ from tfeti_dolfinx.common.parallel import largest, summed
 from tfeti_dolfinx.common.validation import named
 from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.constraints.gluing import Gluing
+from tfeti_dolfinx.contact.partner import position_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy
@@ -329,6 +330,10 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
     def take(self, other: Report) -> None:
         """Take all fields of another report: a program may hold this one over many solves."""
         vars(self).update(vars(other))
+
+    def contact(self, which: int | str = 0) -> ContactSummary:
+        """Return the entry of a contact, given its name or its position."""
+        return self.contacts[position_of([contact.name for contact in self.contacts], which)]
 
     @property
     def counters(self) -> dict[str, int]:

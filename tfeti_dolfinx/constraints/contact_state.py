@@ -181,7 +181,8 @@ class ContactState:
             InputError: There is no such contact, or several have the name.
         """
         with agreeing(self.dofs.comm, "contact") as given:
-            position = given["contact"] = position_of(self.contacts, which)
+            names = [contact.name for contact in self.contacts]
+            position = given["contact"] = position_of(names, which)
         records = self.gluing.records
         own = records.contact == position
         points, places = (x[records.group[own]] for x in (group_points(self.dofs), self.places()))

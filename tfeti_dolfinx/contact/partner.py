@@ -143,9 +143,8 @@ class ContactPartner(ABC):
 # --- Lists of contacts ------------------------------------------------------------------------
 
 
-def position_of(contacts: Sequence[ContactPartner], which: int | str) -> int:
+def position_of(names: Sequence[str], which: int | str) -> int:
     """Return the position of a contact, given that or its name; raise an InputError else."""
-    names = [contact.name for contact in contacts]
     if is_whole(which) and 0 <= which < len(names):
         return int(which)
     if isinstance(which, str) and names.count(which) == 1:
@@ -163,8 +162,9 @@ def gaps_by_position(
     """Return gaps by position of contacts that are given by position or name, each once."""
     checked_type(gaps, Mapping, "gap", "a dictionary from contacts to gaps")
     found: dict[int, Gap] = {}
+    names = [contact.name for contact in contacts]
     for which, gap in gaps.items():
-        position = position_of(contacts, which)
+        position = position_of(names, which)
         if position in found:
             raise InputError(f"gap: contact {position} is there twice, by position and by name")
         found[position] = gap
