@@ -9,6 +9,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.operator import DualOperator
+from tfeti_dolfinx.feti.stopping import Accuracy
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -95,3 +96,17 @@ def test_a_monitor_of_one_s_own():
     inner = [size for step, size in seen if step == "cg"]
     assert len(inner) == p.report.cg_steps > 3
     assert inner[-1] < 1e-3 * max(inner)
+
+
+def test_a_stopping_rule_of_one_s_own():
+    class InEnergy(Accuracy):
+        def ratio(self, changes=True):
+            return self.measures.error / (1e-2 * self.measures.energy)
+
+    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))]
+    _, p = solved(obstacles)
+    _, q = solved(obstacles, Extensions(stopping=InEnergy))
+    assert q.report.F_multiplications < p.report.F_multiplications
+    assert p.report.residuals["energy_error"] < q.report.residuals["energy_error"] <= 1e-2
+    with pytest.raises(tfeti.InputError, match="stopping gave .* without .*; expected a rule"):
+        solved(extensions=Extensions(stopping=lambda *given: None))

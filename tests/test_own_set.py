@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, problem
 
-from tfeti_dolfinx import Obstacle
+from tfeti_dolfinx import NoSolutionError, Obstacle, Plane
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.qp.sets import Face, Product, Status
+from tfeti_dolfinx.qp.sets import Bounds, Face, Product, Status
 from tfeti_dolfinx.testing import check_feasible_set
 
 
@@ -77,3 +77,19 @@ def test_a_set_that_changes_is_asked_for_before_each_solve():
     assert found[0] < -1e-3
     assert found[1] >= -1e-12
     p.destroy()
+
+
+def test_glue_alone_holds_a_block_up_to_its_limit():
+    """16 nodes, and a load of 0.05: what a set bears is seen before a multiplication."""
+    limit = [1e-3]
+    own = Extensions(
+        feasible_set=lambda B: Product([(B.sets.normals, Bounds(-limit[0] / B.scale))])
+    )
+    ceiling = Obstacle("top", Plane((0, 0, 1), (0, 0, -1)))
+    d = decomposed("hexahedron", 3, 4)
+    p = problem(d, (0, 0, -0.05), [ceiling], clamped=(), loaded="bottom", extensions=own)
+    with pytest.raises(NoSolutionError, match="feasible_set has no forces that balance the load"):
+        p.solve()
+    limit[0] = 0.05
+    p.solve()
+    assert p.solution.contact(0).resultant.force == pytest.approx([0, 0, 0.05], abs=1e-7)

@@ -17,6 +17,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.feti.deflation import MakeDeflation
 from tfeti_dolfinx.feti.dual import FeasibleLaw, contact_set
 from tfeti_dolfinx.feti.operator import MakePreconditioner
+from tfeti_dolfinx.feti.stopping import Accuracy, MakeRule
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
@@ -60,6 +61,7 @@ class Extensions:
             ``SoftModes``.
         feasible_set: From B and c to the set of multipliers, asked before each run of the solver;
             ``check_feasible_set`` tests it.
+        stopping: Makes the stopping rule of a solve, say a class derived from ``Accuracy``.
         monitor: Called after each step of the solver.
 
     Raises:
@@ -72,6 +74,7 @@ class Extensions:
     preconditioner: MakePreconditioner | None = None
     deflation: MakeDeflation | None = None
     feasible_set: FeasibleLaw = contact_set
+    stopping: MakeRule = Accuracy
     monitor: Monitor | None = None
 
     def __post_init__(self) -> None:
@@ -100,7 +103,7 @@ def guarded(own: Extensions, options: Options, comm: MPI.Intracomm) -> Extension
     if own.feasible_set is not contact_set:
         parts["feasible_set"] = _on_all_rows(own.feasible_set)
     for name, part in parts.items():
-        if part is not None and part is not contact_set:
+        if part not in (None, contact_set, Accuracy):
             parts[name] = _guarded(part, name, None if name in ("block", "kplus") else comm)
     if options.clusters:
         parts |= plugin("clusters")(options.clusters)
@@ -120,6 +123,7 @@ GIVES = {
     "block": ("Block", PROMISED),
     "kplus": ("GeneralisedInverse", ("solve",)),
     "feasible_set": ("FeasibleSet", [name for name in dir(FeasibleSet) if name[0] != "_"]),
+    "stopping": ("rule derived from Accuracy", [n for n in dir(Accuracy) if n[0] != "_"]),
 }
 
 

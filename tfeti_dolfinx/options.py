@@ -45,12 +45,15 @@ MECHANISMS = {
     "kept_directions": "directions of PCPG conjugate to all before, not to the last one alone",
     "recycled_directions": "directions of earlier solves",
     "newton_on_coulomb": "Newton's method on Coulomb's law, before bounds as a fixed point",
+    "late_schur": "steps of the lumped preconditioner, where subdomains are large, until S pays",
+    "foundation": "a first point of rigid bodies on springs, not the lightest forces that balance",
 }
 # those that an option of their own switches off
 SWITCHES: dict[str, dict[str, Any]] = {
     "d_scaling": {"scaling": "multiplicity"},
     "recycled_directions": {"recycle": 0},
     "newton_on_coulomb": {"friction_type": "fixed_point"},
+    "late_schur": {"pc_type": "dirichlet"},
 }
 
 

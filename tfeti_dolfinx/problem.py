@@ -283,9 +283,11 @@ class ContactProblem:
             goal = None
             if options.rtol == "auto" and self._given_stress is not None:
                 goal = goal_of(self._given_stress, self.dofs, self._thickness)
-            given, own = self._settings, self._settings.extensions.monitor
+            given, own = self._settings, self._settings.extensions
             with added_options(given.prefix, given.factor_options):  # of faces, and of a late S
-                solved = solve_with_friction(dual, options, options.qp_type, start, own, goal)
+                solved = solve_with_friction(
+                    dual, options, options.qp_type, start, own.monitor, goal, own.stopping
+                )
         result, accuracy, settling = solved
         # 2. their displacement
         with stage("recovery", seconds):

@@ -112,7 +112,7 @@ class Dual:
         dimension: int = 3,
     ) -> None:
         self._dimension = dimension
-        self.keeps_directions = "kept_directions" not in without
+        self._without = without
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
@@ -183,10 +183,16 @@ class Dual:
             if not any_rank(comm, apart > LIMITS.parallel * size):
                 return
         self._held_load = None
-        check_solvable(coarse, self._given, load, *self._names)
+        check_solvable(coarse, self._given, self.pulling, load, *self._names)
         limited = len(self._given.pressed) < len(self._given.sets.tangents)
         if not any_rank(comm, limited or size == 0.0):
             self._held_load = load / size
+
+    @property
+    def pulling(self) -> Array:
+        """Rows of contact on this rank that may pull, as a set of one's own lets them."""
+        normals, pull = self._given.sets.normals, np.full(len(self.d), -1.0)
+        return normals[self.law(self._given).project(pull)[normals] < 0.0]
 
     def learn(self) -> None:
         """More solves come: keep directions, where options leave that open, and let S pay."""
@@ -268,8 +274,8 @@ class Dual:
             preconditioner_on=on,
             seen=self.seen,
             recycled=self.recycled,
-            keeps=self.keeps_directions,
-            foundation=self.foundation,
+            keeps="kept_directions" not in self._without,
+            foundation=None if "foundation" in self._without else self.foundation,
         )
 
     def foundation(self, count: int) -> Array:

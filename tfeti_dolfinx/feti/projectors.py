@@ -127,12 +127,11 @@ class NullModes:
     """
 
     def __init__(self, columns: csr_array) -> None:
-        self._columns = LocalMatrix(columns)
+        C = LocalMatrix(columns)
         self._parts = [(rows, dense) for _, rows, dense in parts_of_columns(columns)]
-        self.removed: Callable[[Array], Array] = self._removed if self._parts else np.asarray
-
-    def _removed(self, x: Array) -> Array:
-        return np.asarray(x - self._columns @ self._columns.transposed(x))
+        self.removed: Callable[[Array], Array] = np.asarray
+        if self._parts:
+            self.removed = lambda x: np.asarray(x - C @ C.transposed(x))
 
     def pinned(self, scale: Array) -> Array:
         """1 at entries that determine the modes, scaled by 1/``scale``; 0 at others."""

@@ -183,13 +183,15 @@ def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
 def check_solvable(
     coarse: CoarseSpace,
     constraints: Constraints,
+    pulling: Array,
     load: Array,
     body_names: Sequence[str],
     mode_names: Sequence[str],
 ) -> None:
     """Raise if the load moves a body that neither contact nor friction can hold. Collective.
 
-    ``load`` is its work on each motion of the bodies.
+    ``load`` is its work on each motion of the bodies; ``pulling`` are local rows of contact that
+    hold both ways, as far as is known before the solve.
     """
     motion = bcast_from_root(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
     reason = (
@@ -197,7 +199,7 @@ def check_solvable(
         "spring, or balance the load"
     )
     if motion is None and coarse.unheld.free.any():
-        scene, found = rigid_scene(coarse, constraints, cones=True), None
+        scene, found = rigid_scene(coarse, constraints, pulling, cones=True), None
         with raised_on_all_ranks(coarse.comm):
             if scene is not None:
                 found = _explained(scene, coarse, constraints.sets.tangents.shape[1])
@@ -209,18 +211,20 @@ def check_solvable(
         raise NoSolutionError(f"{words}: {reason}")
 
 
-def sliding_body(coarse: CoarseSpace, constraints: Constraints) -> int:
+def sliding_body(coarse: CoarseSpace, constraints: Constraints, pulling: Array) -> int:
     """Return a body that the load moves; -1: forces within the limits hold it. Collective."""
     if not coarse.unheld.free.any():
         return -1
-    scene, body = rigid_scene(coarse, constraints, cones=False), -1
+    scene, body = rigid_scene(coarse, constraints, pulling, cones=False), -1
     with raised_on_all_ranks(coarse.comm):
         if scene is not None and (y := scene.escape()) is not None:
             body = int(scene.body[np.argmax(np.abs(y))])
     return bcast_from_root(coarse.comm, body)
 
 
-def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> RigidScene | None:
+def rigid_scene(
+    coarse: CoarseSpace, constraints: Constraints, pulling: Array, cones: bool
+) -> RigidScene | None:
     """Gather the rows of all ranks on rank 0; None on others. Collective.
 
     With ``cones`` Coulomb's law bounds friction by the forces of normals; else the present limits
@@ -238,7 +242,8 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
         [rows_times(J[sets.tangents[some, k]], w[some, k]) for k in range(sets.tangents.shape[1])]
         for some, w in ((pressed, mu), (given, constraints.limits * over))
     ]
-    own = (J[np.setdiff1d(sets.normals, above)], J[above], *along)
+    presses = vstack([J[np.setdiff1d(sets.normals, above)], -J[pulling]], format="csr")
+    own = (presses, J[above], *along)
     ranks = coarse.comm.gather(own, root=0)
     if ranks is None:
         return None

@@ -383,3 +383,7 @@ class Accuracy(StoppingRule):
         if not self.reached:
             return 0.0
         return self.reached[-1].bound.error / max(self.reached[-1].allowed, TINY)
+
+
+# from the dual problem, rtol, atol, b₀ with what rounding leaves of it, and ‖F‖ to a stopping rule
+MakeRule = Callable[[Dual, float, float, tuple[float, float], float], Accuracy]

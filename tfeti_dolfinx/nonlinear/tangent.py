@@ -32,7 +32,8 @@ def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
     on_facets = [
         i
         for i in F.integrals()
-        if i.integral_type() != "cell" and not _has_gradient_of(i.integrand(), u)
+        if i.integral_type() != "cell"
+        and not any(e == ufl.grad(u) for e in unique_pre_traversal(i.integrand()))
     ]
     tangent = ufl.derivative(ufl.Form([*inside.integrals(), *on_facets]), u, w)
     deformation = ufl.Identity(len(u)) + ufl.grad(u)
@@ -49,9 +50,3 @@ def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
     gradient = moved(stretched(w), stretched(v)) - moved(ufl.grad(w), ufl.grad(v))
     change = {ufl.grad(v): expand_derivatives(gradient), v: Zero(v.ufl_shape)}
     return tangent + ufl.replace(inside, change)
-
-
-def _has_gradient_of(expression: Any, u: fem.Function) -> bool:
-    """Return whether ∇u is in an expression."""
-    gradients = (e for e in unique_pre_traversal(expression) if isinstance(e, ufl.classes.Grad))
-    return any(e.ufl_operands[0] == u for e in gradients)

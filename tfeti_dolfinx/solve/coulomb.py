@@ -11,7 +11,7 @@ from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.common.parallel import any_rank, norm_over, steering, summed
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.solvability import sliding_body
-from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
+from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget, MakeRule
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.friction_newton import (
     DEFAULT,
@@ -79,6 +79,7 @@ def solve_with_friction(
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
     goal: ErrorTarget | None = None,
+    make_rule: MakeRule = Accuracy,
     parameters: CoulombParameters = CoulombParameters(),
 ) -> tuple[QPResult, Accuracy, FixedPointStatus]:
     """Solve the dual problem with bounds of friction that fit the forces of normals. Collective.
@@ -91,7 +92,8 @@ def solve_with_friction(
     """
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
         dual.bound_friction(None)  # there may have been coefficients
-        return *solve_dual(dual, options, qp_type, start, monitor, goal), FixedPointStatus()
+        solved = solve_dual(dual, options, qp_type, start, monitor, goal, make_rule)
+        return *solved, FixedPointStatus()
     least = options.number if goal is None else parameters.with_target * options.friction_rtol
     tolerance = min(options.friction_rtol, parameters.beside_rtol * least)
     bounds = FrictionBounds(dual, start, parameters)
@@ -106,7 +108,9 @@ def solve_with_friction(
             rtol = least if near else max(least, min(rtol, parameters.share * change))
         asked = rtol if law is None else least
         exact = goal if asked <= least else None
-        result, rule = solve_dual(dual, options, qp_type, law or start, monitor, exact, rtol=asked)
+        result, rule = solve_dual(
+            dual, options, qp_type, law or start, monitor, exact, make_rule, rtol=asked
+        )
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         if result.reason <= 0:
             if law is not None:
@@ -190,7 +194,8 @@ class FrictionBounds:
         self._dual.bound_friction(self.now)
         if self.stick:
             return True
-        sliding = sliding_body(self._dual.coarse, self._dual.constraints)
+        dual = self._dual
+        sliding = sliding_body(dual.coarse, dual.constraints, dual.pulling)
         if sliding < 0:
             return True
         self.body = sliding

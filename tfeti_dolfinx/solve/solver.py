@@ -11,10 +11,11 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
+from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError
+from tfeti_dolfinx.feti.dual import Dual, contact_set
+from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget, MakeRule
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.coarse import imbalance
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
@@ -28,6 +29,7 @@ from tfeti_dolfinx.qp.problem import (
     no_monitor,
     operator_product,
 )
+from tfeti_dolfinx.qp.projection import UNBALANCED
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 EXPLANATIONS = {
@@ -87,6 +89,7 @@ def solve_dual(
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
     goal: ErrorTarget | None = None,
+    make_rule: MakeRule = Accuracy,
     rtol: float | None = None,
 ) -> tuple[QPResult, Accuracy]:
     """Solve the dual problem, and look at the answer. Collective.
@@ -102,6 +105,7 @@ def solve_dual(
         start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
         monitor: Called after each step; default as options say.
         goal: What bounds the algebraic error in energy has to come down to, too.
+        make_rule: Makes the stopping rule.
         rtol: Relative tolerance of the displacement; default that of the options.
 
     Returns:
@@ -112,11 +116,18 @@ def solve_dual(
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _start(start, qp)
     homogenised = _homogenise(dual, qp, solver, begin)
+    # of a set of one's own solvability knows which rows pull, not how much they bear
+    own = dual.law is not contact_set and solver.cold is not None
+    if own and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
+        raise NoSolutionError(
+            "extensions: feasible_set has no forces that balance the load; expected a set that "
+            "bears it, or a Dirichlet condition or a spring besides"
+        )
     if monitor is None and options.monitor:
         monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count["solver"])
     rtol = options.number if rtol is None else rtol
     scale = homogenised.reference, homogenised.rounding
-    rule = Accuracy(dual, rtol, options.atol, scale, qp.norm)
+    rule = make_rule(dual, rtol, options.atol, scale, qp.norm)
     rule.goal, rule.waits = goal, goal is not None  # assessments against a target are costly
     parameters = getattr(options, qp_type, solver.parameters)
     result = solver.solve(
@@ -131,7 +142,7 @@ def solve_dual(
     rounding = result.reason == ConvergedReason.DIVERGED_ROUNDING
     if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
         late.steps = 0  # K_bb of thin parts spans more digits than S: begin again
-        return solve_dual(dual, options, qp_type, start, monitor, goal, rtol)
+        return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
     if (state := rule.recovered) is not None:
         dual.last.looked = state.lam, state.residual
