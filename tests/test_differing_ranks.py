@@ -18,8 +18,8 @@ from scenes import box, clamp, decomposed, forms, hooke
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.agreement import agreeing, described
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.output import write_xdmf
-from tfeti_dolfinx.plot import plot_pressure
+from tfeti_dolfinx.io.output import write_xdmf
+from tfeti_dolfinx.io.plot import plot_pressure
 
 pytestmark = pytest.mark.timeout(100)
 

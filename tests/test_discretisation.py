@@ -8,7 +8,7 @@ from scenes import box, clamp, curved_obstacle, decomposed, forms, hooke, proble
 from true_errors import AGAINST_FINER, ball, error_against, lame_error, shrink_fit, stress_of_cells
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.output import cell_fields
+from tfeti_dolfinx.io.output import cell_fields
 
 RTOL = {"rtol": 1e-7}
 

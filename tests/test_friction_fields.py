@@ -7,7 +7,7 @@ from scenes import decomposed, displacement, largest, problem
 from test_tresca import nodal_data
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.output import nodal_fields
+from tfeti_dolfinx.io.output import nodal_fields
 
 EXACT = {"rtol": 1e-10}
 

@@ -7,9 +7,10 @@ from full_disk import full, left_in
 from scenes import curved_obstacle, decomposed, largest, problem
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import InputError, TfetiError, draw
-from tfeti_dolfinx.output import cell_fields, nodal_fields, write_pvd, write_vtx, write_xdmf
-from tfeti_dolfinx.plot import plot_deformed, plot_friction, plot_pressure
+from tfeti_dolfinx import InputError, TfetiError
+from tfeti_dolfinx.io import draw
+from tfeti_dolfinx.io.output import cell_fields, nodal_fields, write_pvd, write_vtx, write_xdmf
+from tfeti_dolfinx.io.plot import plot_deformed, plot_friction, plot_pressure
 
 
 @pytest.fixture(scope="module", params=["quadrilateral", "tetrahedron"])

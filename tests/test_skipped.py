@@ -97,7 +97,7 @@ from pathlib import Path
 sys.path.insert(0, "tests")
 from scenes import curved_obstacle, decomposed, problem
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.output import write_vtx
+from tfeti_dolfinx.io.output import write_vtx
 p = problem(decomposed("triangle", 3, 2), contacts=[tfeti.Obstacle("bottom", curved_obstacle(2))])
 p.solve()
 write_vtx(Path(sys.argv[1]) / "u.bp", p.solution)

@@ -47,6 +47,8 @@ from tfeti_dolfinx.errors import (
 )
 from tfeti_dolfinx.extensions import PLUGINS, plugin
 from tfeti_dolfinx.forms.elasticity import Elasticity
+from tfeti_dolfinx.io.output import write_pvd, write_vtx, write_xdmf
+from tfeti_dolfinx.io.plot import plot_deformed, plot_friction, plot_pressure
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh_reading import read_gmsh
@@ -55,8 +57,6 @@ from tfeti_dolfinx.nonlinear.hyperelasticity import NeoHooke, SaintVenantKirchho
 from tfeti_dolfinx.nonlinear.materials import J2Plasticity
 from tfeti_dolfinx.nonlinear.newton import NewtonTolerances
 from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
-from tfeti_dolfinx.output import write_pvd, write_vtx, write_xdmf
-from tfeti_dolfinx.plot import plot_deformed, plot_friction, plot_pressure
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.solution import Solution

@@ -32,7 +32,7 @@ PLUGINS = {
     "BoundaryElements": "tfeti_dolfinx.bem.boundary_elements:BoundaryElements",
     "Interior": "tfeti_dolfinx.bem.interior:Interior",
     "clusters": "tfeti_dolfinx.clusters:extension",
-    "to_pyvista": "tfeti_dolfinx.plot:to_pyvista",
+    "to_pyvista": "tfeti_dolfinx.io.plot:to_pyvista",
 }
 
 

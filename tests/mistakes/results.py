@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from tfeti_dolfinx.output import write_vtx
-from tfeti_dolfinx.plot import plot_deformed, plot_pressure
+from tfeti_dolfinx.io.output import write_vtx
+from tfeti_dolfinx.io.plot import plot_deformed, plot_pressure
 
 SOLUTION = r"solution is .*; expected the solution of a ContactProblem"
 

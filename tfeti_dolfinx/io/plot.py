@@ -18,7 +18,6 @@ import numpy as np
 from dolfinx import plot as dplot
 from mpi4py import MPI
 
-from tfeti_dolfinx import draw
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.files import checked_path, written_whole
@@ -38,6 +37,7 @@ from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.contact.partner import Obstacle
 from tfeti_dolfinx.contact.rigid_body import Pose, RigidBody
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.io import draw
 from tfeti_dolfinx.solution import Solution
 
 SECONDS = 600
