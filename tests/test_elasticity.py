@@ -113,8 +113,7 @@ def test_moduli_by_names(names, comm):
 # Lamé: radii 1 and 2, pressure 1 inside
 def tube(r, z, E=YOUNG, nu=POISSON):
     """Displacement of a thick tube that cannot grow longer."""
-    A, B = 1 / 3, 4 / 3
-    return np.stack(((1 + nu) / E * ((1 - 2 * nu) * A * r + B / r), 0 * z))
+    return np.stack(((1 + nu) / E * ((1 - 2 * nu) * r + 4 / r) / 3, 0 * z))
 
 
 def shell(r, z, E=YOUNG, nu=POISSON):
@@ -126,10 +125,7 @@ def shell(r, z, E=YOUNG, nu=POISSON):
 
 SHAPES = {
     "tube": (lambda s, t: (1 + s, t), tube),
-    "shell": (
-        lambda s, t: ((1 + s) * np.sin(np.pi / 2 * t), (1 + s) * np.cos(np.pi / 2 * t)),
-        shell,
-    ),
+    "shell": (lambda s, t: (1 + s) * np.stack([f(t * np.pi / 2) for f in (np.sin, np.cos)]), shell),
 }
 
 

@@ -33,7 +33,7 @@ from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.recovery import nearest
 from tfeti_dolfinx.forms.assembly import Forms
-from tfeti_dolfinx.forms.checks import check_mesh, check_same_space, displacement_space
+from tfeti_dolfinx.forms.checks import check_mesh, check_ring, check_same_space, displacement_space
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -154,6 +154,8 @@ class ContactProblem:
         self._accepted: tuple[Solution | None, Start | None] = (None, None)
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
+        if self.contacts:
+            check_ring(a, self.form_name, self._thickness)
         self._seconds = dict(decomposition.seconds)  # of the next solve
         self.report = Report(seconds=self._seconds)
         with stage("assembly", self._seconds):

@@ -63,6 +63,7 @@ def beside_its_axis(s):
     return tfeti.decompose(mesh, 2, facet_tags=tags, surfaces=names)
 
 
+FLOOR = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), normal=(0, 1)))
 THICKNESS = {
     r"thickness is -0\.\d+ in the cell around \[.*; expected a positive number everywhere": made(
         thickness=lambda s: ufl.SpatialCoordinate(s.d.mesh)[0] - 0.3
@@ -72,6 +73,9 @@ THICKNESS = {
         thickness=0.5, model="axisymmetric"
     ),
     r"thickness=0: expected a positive number": lambda s: s.problem(thickness=0),
+    r"a divides a displacement .* axisymmetric body does, and thickness is 1": lambda s: s.problem(
+        a=elastic(s, model="axisymmetric").a(s.u, s.v), contacts=[FLOOR]
+    ),
     r"thickness is of shape \(2,\)": lambda s: s.problem(thickness=fem.Function(s.V)),
     r"thickness has a test or trial function": lambda s: s.problem(thickness=s.v[0]),
 }

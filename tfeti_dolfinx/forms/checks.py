@@ -9,11 +9,15 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
+from ufl.algebra import Division
 from ufl.algorithms import compute_form_data, extract_arguments
 from ufl.algorithms.check_arities import ArityMismatch
 from ufl.constantvalue import Zero
+from ufl.core.terminal import FormArgument
 from ufl.corealg.traversal import unique_pre_traversal
 from ufl.domain import extract_domains
+from ufl.geometry import SpatialCoordinate
+from ufl.indexed import Indexed
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import JIT_OPTIONS, geometry_dofmap
@@ -63,6 +67,25 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
         _check_measures(form, name, decomposition)
     for integral in form.integrals():
         _check_tags(integral, name, decomposition)
+
+
+def check_ring(form: Any, name: str, thickness: Any) -> None:
+    """Raise an InputError if a form has u_r/r of an axisymmetric body, and the thickness is 1."""
+    if isinstance(thickness, ufl.core.expr.Expr) or thickness != 1.0:
+        return
+
+    def has(expression: Any, kind: type) -> bool:
+        parts = (part for part in unique_pre_traversal(expression) if isinstance(part, Indexed))
+        return any(isinstance(part.ufl_operands[0], kind) for part in parts)
+
+    parts = (p for part in form.integrals() for p in unique_pre_traversal(part.integrand()))
+    for above, below in (part.ufl_operands for part in parts if isinstance(part, Division)):
+        if has(above, FormArgument) and has(below, SpatialCoordinate):
+            raise InputError(
+                f"{name} divides a displacement by a coordinate, as that of an axisymmetric body "
+                "does, and thickness is 1: pressures would be forces per length; expected "
+                "thickness=elastic.thickness, or what else the form was multiplied with"
+            )
 
 
 def check_not_negative(
