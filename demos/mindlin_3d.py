@@ -223,6 +223,9 @@ problem.report.errors.update(errors)
 # -
 
 # ## Output
+#
+# Friction is drawn at the nodes of the cut y = 0. Nodal values on tetrahedra scatter about the
+# closed form, most where sticking ends: that has a kink there, and elements are a tenth of a.
 
 # +
 if arguments.output:

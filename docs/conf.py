@@ -97,6 +97,7 @@ html_sidebars: dict[str, list[str]] = {page: [] for page in bare}
 
 # made here: a page for each demo, and one for each class and function
 EXAMPLES, API = ROOT / "docs" / "examples", ROOT / "docs" / "api"
+API_LIST = ROOT / "docs" / "api.md"
 VIEWS = ("ball_bearing_3d", "bolted_joint_3d", "clamped_connection_3d", "stacked_blocks_3d")
 BLOCK = re.compile(r"^```\{eval-rst\}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 ENTRY = re.compile(r"^\.\. (auto\w+):: (\S+)\n((?:   .*\n)*)", re.MULTILINE)
@@ -160,7 +161,7 @@ def write_if_new(target: Path, text: str) -> None:
 def write_api(app: Sphinx) -> None:
     """Write a page for each entry of the API's list."""
     API.mkdir(exist_ok=True)
-    for block in BLOCK.findall((ROOT / "docs/api.md").read_text()):
+    for block in BLOCK.findall(API_LIST.read_text()):
         for directive, name, options in ENTRY.findall(block):
             entry = f".. currentmodule:: tfeti_dolfinx\n.. {directive}:: {name}\n{options}"
             short = name.rpartition(".")[2]
@@ -252,6 +253,23 @@ def shorten_signature(
     return None
 
 
+def mend_source_links(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], tree: Any
+) -> None:
+    """Lead from the source of a module to entries whose names begin with another module, too."""
+    if not page.startswith("_modules/"):
+        return
+    named = {entry[1].rpartition(".")[2]: entry[1] for entry in ENTRY.findall(API_LIST.read_text())}
+
+    def whole(link: re.Match[str]) -> str:
+        name = named.get(link[1], link[1])
+        path = name if "." in name else f"tfeti_dolfinx.{name}"
+        return f"/{link[1]}.html#{path}{link[2]}"
+
+    pattern = r"/(\w+)\.html#[\w.]*?\.\1((?:\.\w+)?)(?=\")"
+    context["body"] = re.sub(pattern, whole, context["body"])
+
+
 def write_root_page(app: Sphinx, error: Exception | None) -> None:
     """Write ``index.html``, which leads to the first page: that is in a folder of its own."""
     if error is None and app.builder.format == "html":
@@ -270,4 +288,5 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", list_api)
     app.connect("source-read", keep_numbers_whole)
     app.connect("autodoc-process-signature", shorten_signature)
+    app.connect("html-page-context", mend_source_links)
     app.connect("build-finished", write_root_page)

@@ -140,7 +140,7 @@ NOT_RUN = {
     "./run python3 docs/pictures.py": "the demos at their default sizes; minutes",
     "./run python3 -m sphinx ": ".ci/run builds the documents, with -W",
 }
-DIRECTIVES = ("{toctree}", "{eval-rst}")
+DIRECTIVES = ("{toctree}", "{eval-rst}", "{include}")
 
 
 def test_every_block_of_a_page_is_run_or_has_a_reason():

@@ -143,16 +143,18 @@ class ContactSummary:
 
     Attributes:
         name: Its name.
-        nodes: Nodes of its (secondary) surface that have a condition.
+        surface: The surface that has its nodes, of a pair the secondary one.
+        nodes: Nodes of that surface that have a condition.
         touching: Those that touch; ``sticking`` and ``sliding`` are those of them with friction.
         sticking: Nodes that stick.
         sliding: Nodes that slip.
-        resultant: Force on that surface, friction included, ``gdim`` components.
+        resultant: Force on it, friction included, ``gdim`` components.
         pressure: The largest of nodes of which the other side covers 2 % or more, if one touches.
         gap: The smallest, negative for an overlap.
     """
 
     name: str
+    surface: str
     nodes: int
     touching: int
     sticking: int
@@ -182,15 +184,15 @@ class ContactSummary:
         pressure, others, ends = np.where(np.isfinite(extremes), extremes, 0.0)
         pressure = np.where(pressure > 0.0, pressure, np.maximum(others, 0.0)).tolist()
         gaps = (0.0 - ends).tolist()
-        names = [contact.name for contact in solution.contacts]
-        columns: list[Any] = [names, *counts, forces, pressure, gaps]
+        names = zip(*((c.name, c.surfaces[0]) for c in solution.contacts), strict=True)
+        columns: list[Any] = [*names, *counts, forces, pressure, gaps]
         return [cls(*row) for row in zip(*columns, strict=True)]
 
     def __str__(self) -> str:
         force = ", ".join(f"{value:.3g}" for value in self.resultant)
         line = (
-            f"{self.name}: {self.touching} of {self.nodes} nodes touch, force ({force}), "
-            f"pressure up to {self.pressure:.3g}, smallest gap {self.gap:.2g}"
+            f"{self.name}: {self.touching} of {self.nodes} nodes touch, force ({force}) "
+            f"on {self.surface!r}, pressure up to {self.pressure:.3g}, smallest gap {self.gap:.2g}"
         )
         rubs = self.sticking + self.sliding
         return f"{line}, {self.sticking} stick, {self.sliding} slip" if rubs else line

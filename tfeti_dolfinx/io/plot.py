@@ -126,8 +126,8 @@ def plot_deformed(
             if highest is None and show == "von_mises" and len(whole["values"]):
                 scene["highest"] = max(float(np.quantile(whole["values"], 0.995)), 1e-300)
             if scene.pop("obstacles"):
-                moved = whole["moved"] * scene["factor"]
-                scene |= _obstacles(solution, whole["points"], moved)
+                both = whole["points"], whole["moved"] * scene["factor"]
+                scene |= _obstacles(solution, *both, scene["focus"], zoom)
             _draw(target, {**whole, **scene})
     return target
 
@@ -338,13 +338,18 @@ def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
     return whole
 
 
-def _obstacles(solution: Solution, points: Array, moved: Array) -> dict[str, Array]:
-    """Return the distances of obstacles on a grid around the bodies, and its corners."""
+def _obstacles(
+    solution: Solution, points: Array, moved: Array, focus: Array, zoom: float
+) -> dict[str, Array]:
+    """Return the distances of obstacles on a grid around what is seen, and its corners."""
     gdim = solution.decomposition.mesh.geometry.dim
     both = np.vstack((points, points + np.nan_to_num(moved)))
     low, high = both.min(axis=0), both.max(axis=0)
     margin = MARGIN * float((high - low).max())
     box = np.stack((low, high)) + np.array([[-margin], [margin]])
+    if np.all(np.isfinite(focus)):
+        centre, seen = np.clip(focus, *box), float(np.linalg.norm(high - low)) / zoom
+        box = np.clip(box, centre - seen, centre + seen)
     box[:, gdim:] = low[gdim:]
     axes = [np.linspace(start, stop, SAMPLES[gdim]) for start, stop in box.T[:gdim]]
     axes += [low[gdim:]] * (3 - gdim)
