@@ -1,6 +1,6 @@
-"""Demos on more subdomains, on more ranks, and cut into subdomains of other sizes.
+"""Demos on more subdomains, and on more ranks.
 
-    ./run python3 benchmarks/scaling.py weak|strong|sizes [--quick | --large] [--ranks 2]
+    ./run python3 benchmarks/scaling.py weak|strong [--quick | --large] [--ranks 2]
 
 Starts mpirun itself; runs take turns, and of each the best counts. Set-up is included; gmsh, which
 meshes on one rank, has a column of its own.
@@ -9,11 +9,6 @@ weak: more subdomains of the same size, on the same ranks. A scene that scales h
     multiplications whatever its size, and seconds in proportion to its unknowns.
 strong: the same scene on 1, 2, 4, ... ranks; ``--ranks`` is the most to try, say the cores. Beside
     the seconds is what memory gives as many ranks together: GB/s of y ← αx + y on long vectors.
-sizes: one mesh cut into more and more subdomains, H/h elements along the edge of each (of METIS
-    parts the cube root of their cells over 6), whose K⁺ and S are applied through sparse factors
-    (``implicit``), by a dense matrix of each (``explicit``), and as the package chooses (``auto``).
-    ``F measured`` are the seconds of one multiplication by F that are spent in the subdomains.
-
 Results go to results/scaling_weak.md, .json and .png, and so on.
 """
 
@@ -45,13 +40,6 @@ STRONG = {
 }
 STRONG_LARGE = {**STRONG, "hertz_3d": ["--unknowns", 235_000, "--subdomains", 64]}
 STRONG_QUICK = {"cube_3d": ["--subdomains", 8, "--cells", 3]}
-# sizes: unknowns or cells of the mesh, and numbers of subdomains
-SIZES = {"cube_3d": (24, (8, 27, 64, 216)), "hertz_3d": (30_000, (4, 8, 16, 32, 64))}
-SIZES_LARGE = {"cube_3d": (48, (64, 216, 512)), "hertz_3d": (235_000, (16, 32, 64, 128))}
-SIZES_QUICK = {"cube_3d": (6, (8,)), "hertz_3d": (4_000, (4,))}
-TYPES = ("implicit", "explicit", "auto")
-# vertices of a tetrahedral mesh have some 5.5 cells each
-CELLS_PER_NODE = 5.5
 
 
 def configure(parser):
@@ -134,50 +122,10 @@ def strong(arguments, options):
     return tables
 
 
-def sizes(arguments, options):
-    """A table for each demo, a row for each number of subdomains and each type."""
-    tables = {}
-    scenes = SIZES_QUICK if arguments.quick else SIZES_LARGE if arguments.large else SIZES
-    for name, (size, counts) in scenes.items():
-        cases, runs = [(n, kind) for n in counts for kind in TYPES], []
-        for n, kind in cases:
-            mesh = ["--cells", size // round(n ** (1 / 3))]
-            mesh = mesh if name == "cube_3d" else ["--unknowns", size]
-            words = [*mesh, "--subdomains", n, *NEWTON, "-tfeti_local_type", kind, *options]
-            runs.append((name, words, arguments.ranks))
-        reports = best_runs(runs, arguments)
-        tables[f"{name}, {arguments.ranks} ranks"] = [
-            {
-                "H/h": edge(name, size, report),
-                "subdomains": report["subdomains"],
-                "type": kind,
-                "unknowns of one": round(report["primal_dofs"] / report["subdomains"]),
-                **costs(report),
-                "F measured": report["local_operators"]["F_measured"],
-                "forms": ", ".join(
-                    word.removeprefix("F_")
-                    for word in report["local_operators"]
-                    if word.startswith("F_") and word.endswith("plicit")
-                ),
-            }
-            for (_, kind), report in zip(cases, reports, strict=True)
-        ]
-    return tables
-
-
-def edge(name, size, report):
-    """H/h of a subdomain."""
-    if name == "cube_3d":
-        return size // round(report["subdomains"] ** (1 / 3))
-    cells = CELLS_PER_NODE * report["primal_dofs"] / 3 / report["subdomains"]
-    return round((cells / 6) ** (1 / 3), 1)  # six tetrahedra fill a cube
-
-
 # what is run, and the columns of its picture
 STUDIES = {
     "weak": (weak, (("subdomains", "F"), ("unknowns", "processor"))),
     "strong": (strong, (("ranks", "faster"),)),
-    "sizes": (sizes, (("H/h", "processor"),)),
 }
 
 
@@ -187,15 +135,13 @@ def main(argv):
     run, columns = STUDIES[arguments.study]
 
     def draw(path, tables):
-        """A panel for each pair of columns, a line for each table, or type in it."""
+        """A panel for each pair of columns, a line for each table."""
         with picture(path, len(columns)) as axes:
             for panel, (x, y) in zip(axes, columns, strict=True):
-                lines = {}
-                for title, rows in tables.items():
-                    for kind in dict.fromkeys(row.get("type", "") for row in rows):
-                        own = [row for row in rows if row.get("type", "") == kind]
-                        label = f"{title.split(':')[0]} {kind}".strip()
-                        lines[label] = column(own, x), column(own, y)
+                lines = {
+                    title.split(":")[0]: (column(rows, x), column(rows, y))
+                    for title, rows in tables.items()
+                }
                 curves(panel, arguments.study, (x, y), lines, "x" if y == "F" else "xy")
 
     return finish(arguments, f"scaling_{arguments.study}", run(arguments, options), draw)

@@ -29,7 +29,7 @@ from mpi4py import MPI
 from benchmarks.stability_scenes import CELLS, LADDERS, Ladder, label
 from benchmarks.stress.judge import run_scene
 from benchmarks.stress.scene import Scene
-from benchmarks.tools import command_line, finish, say
+from benchmarks.tools import Tables, command_line, finish, say
 
 WITHIN = 100.0  # of rtol, of the report's estimate, of the noise of the direct solution
 QUICK = ("triangle",)
@@ -91,6 +91,29 @@ def locking(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
+def ladders(tables: Tables) -> Tables:
+    """A row for each ladder: of all cells the multiplications over the friendly scene's."""
+    found = {title: rows for title, rows in tables.items() if title == "locking"}
+    found["ladders"] = []
+    for all_rows in (rows for title, rows in tables.items() if title not in found):
+        for name in dict.fromkeys(row["scene"] for row in all_rows):
+            rows = [row for row in all_rows if row["scene"] == name]
+            right = [row for row in rows if row["verdict"] == "right"]
+            rungs = dict.fromkeys(row["value"] for row in right)
+            times = [max(r["of friendly"] for r in right if r["value"] == v) for v in rungs]
+            others = [f"{r['cell']} {r['value']}: {r['verdict']}" for r in rows if r not in right]
+            found["ladders"].append(
+                {
+                    "ladder": name,
+                    "rungs": "; ".join(map(str, rungs)),
+                    "times": "; ".join(f"{most:.1f}" for most in times),
+                    "largest error": f"{max(row['error'] for row in right):.0e}",
+                    "not right": ", ".join(others),
+                }
+            )
+    return found
+
+
 def main(argv):
     """Climb the ladders and write what came out; returns the tables."""
     arguments, _ = command_line(__doc__, argv, configure)
@@ -107,7 +130,7 @@ def main(argv):
     if MPI.COMM_WORLD.rank == 0 and "nu" in tables:
         tables["locking"] = locking(tables["nu"])
     tables = MPI.COMM_WORLD.bcast({title: rows for title, rows in tables.items() if rows})
-    return finish(arguments, "stability", tables)
+    return finish(arguments, "stability", tables, shown=ladders)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,6 @@ RUNS = [
     with_arguments(scaling, "strong", "--ranks", "2"),
     with_arguments(talk_tables, "--rtol", "1e-4"),
     with_arguments(solver_profiles, "--steps", "100", slow=True),
-    with_arguments(scaling, "sizes", "--ranks", "1", slow=True),
     with_arguments(time_against_error, "--ranks", "1", "--scenes", "half cylinder", slow=True),
     with_arguments(scaling, "weak", slow=True),
 ]
