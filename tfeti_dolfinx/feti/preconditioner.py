@@ -108,11 +108,7 @@ class FacePreconditioner:
         if metric.near is not None and size > 0.0:
             with raised_on_all_ranks(comm):
                 K, next_to = metric.near()
-
-            def apply(u: Array, out: Array) -> None:
-                out[:] = K @ u
-
-            self.apply = apply
+            self.apply = lambda u, out: np.copyto(out, K @ u)
             self.weights = np.concatenate((self.weights, next_to / size))
         with raised_on_all_ranks(comm):
             own = _largest_eigenvalue(self.apply, self.weights)

@@ -106,10 +106,7 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
     total, (n, gdim) = int(sizes_of(body, len(shares), comm).sum()), x.shape
     centre = np.zeros((len(home), gdim))
     apart = 2.0 ** (ROUND.bits + 2)  # bodies are along one more axis
-
-    def centres() -> cKDTree:
-        return cKDTree(np.column_stack((centre, apart * home)))
-
+    tree = cKDTree(np.column_stack((centre, apart * home)))
     for stage, (sample, rounds, way) in enumerate(ROUND.stages):
         some: Array = np.arange(n)
         if sample * len(home) < total:
@@ -122,7 +119,7 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
             spread = summed(comm, sum_rows(own, away, len(home)))
             influence = np.maximum(spread / np.maximum(sizes_of(own, len(home), comm), 1), 1.0)
         else:
-            own = centres().query(np.column_stack((y, apart * of)))[1].astype(np.int64)
+            own = tree.query(np.column_stack((y, apart * of)))[1].astype(np.int64)
             own = _nearest(y, own, centre, influence, home)
         goal = (sizes_of(of, len(shares), comm) / shares)[home]
         for _ in range(rounds):
@@ -133,7 +130,7 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
                 break
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
-            tree = centres()
+            tree = cKDTree(np.column_stack((centre, apart * home)))
             next_one = tree.query(tree.data, k=2)[0][:, 1]
             influence = np.minimum(influence, ROUND.influence * np.maximum(next_one, 1.0))
             own = _nearest(y, own, centre, influence, home)

@@ -42,11 +42,8 @@ def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
     def stretched(y: Any) -> Any:
         return inverse.T * ufl.sym(deformation.T * ufl.grad(y))
 
-    def moved(of_w: Any, of_v: Any) -> Any:
-        return (of_w * inverse).T * of_v
-
     # F is linear in ∇v: the difference of both geometric parts is that of one gradient; v itself,
     # as body forces have it, has none
-    gradient = moved(stretched(w), stretched(v)) - moved(ufl.grad(w), ufl.grad(v))
+    gradient = (stretched(w) * inverse).T * stretched(v) - (ufl.grad(w) * inverse).T * ufl.grad(v)
     change = {ufl.grad(v): expand_derivatives(gradient), v: Zero(v.ufl_shape)}
     return tangent + ufl.replace(inside, change)

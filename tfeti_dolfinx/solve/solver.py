@@ -98,18 +98,10 @@ def solve_dual(
     not even that where there is no kernel and it starts where the last solve has ended. Block
     Newton multiplies once, and not even that where it starts at the end of the last solve.
 
-    Args:
-        dual: The dual problem.
-        options: Options.
-        qp_type: A solver of ``SOLVERS``.
-        start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
-        monitor: Called after each step; default as options say.
-        goal: What bounds the algebraic error in energy has to come down to, too.
-        make_rule: Makes the stopping rule.
-        rtol: Relative tolerance of the displacement; default that of the options.
-
-    Returns:
-        Multipliers, and their displacement with its measured accuracy.
+    ``start`` are λ on this rank's rows, and the multipliers of Gλ = e, to start from; ``monitor``
+    is called after each step, by default as options say; bounds of the algebraic error in energy
+    come down to ``goal``, too; ``rtol`` is by default that of the options. Return multipliers, and
+    the rule, which has their displacement and its measured accuracy.
     """
     cite("tfeti", qp_type)
     solver = SOLVERS[qp_type]
