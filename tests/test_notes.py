@@ -57,8 +57,8 @@ def test_no_contact_is_no_contact_that_does_not_touch():
 )
 def test_pressures_of_nodes_that_are_hardly_covered(cell, beyond, secondary, expected):
     """A block whose edge is a little beyond a node of the face on which it is pressed."""
-    width = (1.0 + beyond) / 3.0
-    d = stacked(cell, 3, 4, 4, upper=(0.0, width))
+    width, gap = (1.0 + beyond) / 3.0, -0.02 if beyond > 0.1 else 0.0
+    d = stacked(cell, 3, 4, 4, upper=(0.0, width), gap=gap)
     sides = ["lower bottom", "lower left", "upper left"]
     sides += ["lower front", "upper front"] if cell == "hexahedron" else []
     primary = {"lower top": "upper bottom", "upper bottom": "lower top"}[secondary]
@@ -70,6 +70,8 @@ def test_pressures_of_nodes_that_are_hardly_covered(cell, beyond, secondary, exp
     load = 0.1 * width ** (d.mesh.geometry.dim - 1)
     assert np.isclose(abs(summary.resultant[-1]), load, rtol=1e-5)
     assert len(found) == expected
+    overlaps = [note for note in p.report.notes if "surfaces overlap by up to 0.02" in note]
+    assert len(overlaps) == (gap < 0.0)
     assert 0.1 <= summary.pressure <= 0.5  # 0.1 is the mean, and edges have more
     if expected:
         assert float(re.search(r"up to (\S+) at nodes", found[0])[1]) > 0.5

@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root
+from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest
 from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -100,6 +100,8 @@ class WarningLimits:
     facets: float = 0.5
     # a pressure that is not believed over the largest of other nodes; at edges they differ by less
     stands_out: float = 2.0
+    # a gap below 0 that a mesh has, over the largest displacement: forces follow from it then
+    overlaps: float = 0.1
     listed: int = 3  # bodies that a sentence names
 
 
@@ -242,7 +244,8 @@ class Diagnostics:
         change = records.curved_gap - records.geometric_gap
         overlap = -change - np.maximum(solution.remaining_gap, 0.0)
         change = np.where(solution.force > 0.0, np.abs(change), overlap)
-        pressure = solution.force / records.area
+        believed = records.covered >= SEARCH.believed
+        pressure = np.where(believed, solution.force, 0.0) / records.area
         for i, contact in enumerate(solution.contacts):
             own = records.contact == i
             largest = comm.allreduce(float(pressure[own].max(initial=0.0)), op=MPI.MAX)
@@ -311,7 +314,8 @@ def _loose(outcome: Outcome) -> Iterator[str]:
 
 def notes_of(outcome: Outcome, solution: Solution) -> list[str]:
     """Return what is worth knowing of an answer, whose displacement is right. Collective."""
-    return [*_untouched(outcome, solution), *_hardly_covered(solution), *_free(outcome)]
+    of_meshes = *_hardly_covered(solution), *_overlapping(solution)
+    return [*_untouched(outcome, solution), *of_meshes, *_free(outcome)]
 
 
 def _untouched(outcome: Outcome, solution: Solution) -> Iterator[str]:
@@ -343,6 +347,23 @@ def _hardly_covered(solution: Solution) -> Iterator[str]:
             f"the other side covers less than {SEARCH.believed:.0%}, elsewhere they are at most "
             f"{most[0, i]:.3g}; forces are right, pressures of such nodes are not: "
             "expected the other side as the secondary one, or a node where the other side ends"
+        )
+
+
+def _overlapping(solution: Solution) -> Iterator[str]:
+    """Pairs that press on each other since they overlap as they are meshed. Collective."""
+    records, comm, contacts = solution.gluing.records, solution.dofs.comm, solution.contacts
+    pairs = [len(c.surfaces) == 2 and isinstance(c.gap, str) for c in contacts]
+    if solution.finite or not any(pairs):
+        return
+    depth = np.zeros(len(contacts))
+    np.maximum.at(depth, records.contact, np.where(solution.force > 0.0, -records.gap, 0.0))
+    comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
+    for i in np.flatnonzero(pairs & (depth > LIMITS.overlaps * largest(comm, solution.u))):
+        yield (
+            f"{contacts[i].name}: the surfaces overlap by up to {depth[i]:.2g} as they are meshed, "
+            "and are pressed apart; where no interference is meant: expected smaller facets, a "
+            "mesh of degree 2, or gap= with the clearance"
         )
 
 
