@@ -1,6 +1,6 @@
 """Where the Schur complements are dear to make, the lumped preconditioner begins a solve."""
 
-from dataclasses import replace
+from functools import partial
 
 import pytest
 from petsc4py import PETSc
@@ -8,7 +8,8 @@ from scenes import apart, curved_obstacle, decomposed, problem
 from test_repeated import Repeated
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti import operator
+from tfeti_dolfinx.extensions import Extensions
+from tfeti_dolfinx.feti.operator import PreconditionerChoice, chosen_preconditioner
 from tfeti_dolfinx.subdomains import sparse_block
 
 SUBDOMAINS = 4
@@ -31,24 +32,18 @@ def solved(*given, **options):
     return report.solver, factors, report.preconditioner_multiplications, u
 
 
-@pytest.fixture
-def late(monkeypatch):
+def late(steps):
     """S is dear everywhere, and pays after so many multiplications."""
-
-    def after(steps):
-        choice = replace(operator.CHOICE, dear=0.0, steps=steps)
-        monkeypatch.setattr(operator, "CHOICE", choice)
-
-    return after
+    choice = PreconditionerChoice(dear=0.0, steps=steps)
+    return Extensions(preconditioner=partial(chosen_preconditioner, choice=choice))
 
 
 @pytest.mark.parametrize("contact", [True, False])
-def test_S_comes_after_some_multiplications_and_the_answer_is_the_same(contact, late):
+def test_S_comes_after_some_multiplications_and_the_answer_is_the_same(contact):
     _, _, fewest, u = solved(contact, tfeti_pc_type="dirichlet", tfeti_rtol=1e-9)
     _, _, most, _ = solved(contact, tfeti_pc_type="lumped", tfeti_rtol=1e-9)
     for steps, factors in ((0, 2), (4, 2), (1000, 1)):
-        late(steps)
-        solver, made, count, found = solved(contact, tfeti_rtol=1e-9)
+        solver, made, count, found = solved(contact, extensions=late(steps), tfeti_rtol=1e-9)
         assert solver == f"{'newton' if contact else 'pcpg'} + late dirichlet"
         assert made == factors
         assert apart(found, u) <= 1e-7
@@ -56,9 +51,8 @@ def test_S_comes_after_some_multiplications_and_the_answer_is_the_same(contact, 
         assert count <= most
 
 
-def test_more_solves_make_S_as_soon_as_they_multiply_by_it(late):
-    late(1000)
-    scene = Repeated(local_type="implicit")
+def test_more_solves_make_S_as_soon_as_they_multiply_by_it():
+    scene = Repeated(extensions=late(1000), local_type="implicit")
     scene.solve()
     report = scene.problem.report
     count, first = report.factorizations, report.preconditioner_multiplications
@@ -82,8 +76,7 @@ def test_it_is_chosen_for_large_subdomains_in_space_alone():
     assert names == ["newton + late dirichlet", *["newton + dirichlet"] * 3]
 
 
-def test_factors_that_come_late_read_the_options_of_the_problem(late, monkeypatch):
-    late(4)
+def test_factors_that_come_late_read_the_options_of_the_problem(monkeypatch):
     given, name, seen = sparse_block.regularised, "pc_factor_mat_solver_type", []
 
     def watched(K, R, fixing, prefix, *others):
@@ -91,17 +84,16 @@ def test_factors_that_come_late_read_the_options_of_the_problem(late, monkeypatc
         return given(K, R, fixing, prefix, *others)
 
     monkeypatch.setattr(sparse_block, "regularised", watched)
-    solved(tfeti_sub_pc_factor_mat_solver_type="mumps")
+    solved(extensions=late(4), tfeti_sub_pc_factor_mat_solver_type="mumps")
     assert seen
     assert set(seen) == {"mumps"}
 
 
-def test_what_rounding_stops_begins_again_with_S_once(late):
+def test_what_rounding_stops_begins_again_with_S_once():
     """No tolerance is met: the lumped solve and that with S both end by rounding."""
-    late(1000)
     _, made, alone, u = solved(tfeti_pc_type="lumped", tfeti_rtol=1e-20)
     assert made == 1
-    _, made, count, found = solved(tfeti_rtol=1e-20)
+    _, made, count, found = solved(extensions=late(1000), tfeti_rtol=1e-20)
     assert made == 2
     assert alone < count < 3 * alone
     assert apart(found, u) <= 1e-12

@@ -22,7 +22,9 @@ MADE_ONCE = {"stiffness", "search", "constraints", "factors", "trace", "coarse p
 class Repeated:
     """A box on a curved obstacle, clamped on the left, that takes other data."""
 
-    def __init__(self, cell="hexahedron", contact=True, parts=6, friction=None, **options):
+    def __init__(
+        self, cell="hexahedron", contact=True, parts=6, friction=None, extensions=None, **options
+    ):
         d = decomposed(cell, 4, parts)
         gdim = d.mesh.geometry.dim
         V, u, v = vectors(d)
@@ -39,6 +41,7 @@ class Repeated:
             [obstacle] if contact else [],
             d,
             petsc_options={"rtol": 1e-10, **options},
+            extensions=extensions,
         )
         self.cell, self.contact, self.options = cell, contact, options
 

@@ -167,8 +167,9 @@ class ContactProblem:
         self._diagnostics = Diagnostics(self.dofs)
         if boundary_elements is not None:
             check_method(boundary_elements, extensions)
-        scene = forms, self.bcs, self.contacts, self.dofs
-        self._system = System(*scene, self._settings, boundary_elements)
+        self._system = System(
+            forms, self.bcs, self.contacts, self.dofs, self._settings, boundary_elements
+        )
 
     @property
     def solution(self) -> Solution:

@@ -421,10 +421,15 @@ class System:
         if self.weights is None or not self.follows:
             scaling = self._settings.options.scaling
             self.weights = row_weights(self._blocks, scaling, dofs.comm)
-        prescribed, slip = made(self._prescribed), self._slip()
-        free = tools if tools.num_unknowns else None
-        given = dofs, prescribed, search.records, search.length, self.weights, slip
-        self._gluing = glue(*given, free)
+        self._gluing = glue(
+            dofs,
+            made(self._prescribed),
+            search.records,
+            search.length,
+            self.weights,
+            slip=self._slip(),
+            tools=tools if tools.num_unknowns else None,
+        )
 
     def _fill_right_side(self) -> None:
         self.search.move()
@@ -465,8 +470,9 @@ class System:
 
     def _make_dual(self) -> None:
         law, names = self._settings.extensions.feasible_set, self.tools.free_names
-        parts = self.gluing.constraints, self.subdomains, self._dofs
-        self._dual = self._settings.make_dual(*parts, law, names)
+        self._dual = self._settings.make_dual(
+            self.gluing.constraints, self.subdomains, self._dofs, law, names
+        )
         self.dual.seen = max(self.dual.seen, self._seen)
         self._equals.kept.clear()
 

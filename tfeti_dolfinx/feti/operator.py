@@ -191,9 +191,9 @@ class LateDirichlet(DualOperator):
     Without ``steps`` S pays, as more solves come.
     """
 
-    def __init__(self, B: PETSc.Mat, subdomains: Subdomains) -> None:
+    def __init__(self, B: PETSc.Mat, subdomains: Subdomains, steps: int) -> None:
         super().__init__(B, subdomains.local_operator("stiffness"))
-        self.steps, self._subdomains = CHOICE.steps, subdomains
+        self.steps, self._subdomains = steps, subdomains
 
     def settle(self) -> None:
         """Make S where it is time. Collective.
@@ -206,7 +206,9 @@ class LateDirichlet(DualOperator):
             made.destroy()
 
 
-def chosen_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
+def chosen_preconditioner(
+    B: PETSc.Mat, subdomains: Subdomains, choice: PreconditionerChoice = CHOICE
+) -> DualOperator:
     """Dirichlet's, or a late one where S is dear. Collective.
 
     Where a subdomain keeps its volume, or springs hold one, the lumped one takes many times as many
@@ -216,11 +218,11 @@ def chosen_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
         return dirichlet_preconditioner(B, subdomains)
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     other = subdomains.num_clusters > 0 or len(sparse) < len(subdomains.elastic)
-    dear = any(block.stiffness.entries > CHOICE.dear * block.stiffness.size for block in sparse)
+    dear = any(block.stiffness.entries > choice.dear * block.stiffness.size for block in sparse)
     held = any(block.kernel.shape[1] < block.modes.shape[1] for block in sparse)
-    stiff = any(block.stiffness.stretch_over_shear > CHOICE.volume for block in sparse)
+    stiff = any(block.stiffness.stretch_over_shear > choice.volume for block in sparse)
     if any_rank(subdomains.comm, dear) and not any_rank(subdomains.comm, other or held or stiff):
-        return LateDirichlet(B, subdomains)
+        return LateDirichlet(B, subdomains, choice.steps)
     return dirichlet_preconditioner(B, subdomains)
 
 

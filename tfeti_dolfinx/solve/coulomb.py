@@ -146,8 +146,10 @@ def solve_with_friction(
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
     result.steps, rule.looks = steps, looks
-    how = (float(change), tolerance, bounds.body, newton.steps, not holds)
-    return result, rule, FixedPointStatus(iterations, *how)
+    status = FixedPointStatus(
+        iterations, float(change), tolerance, bounds.body, newton.steps, slides=not holds
+    )
+    return result, rule, status
 
 
 # --- Bounds of friction -----------------------------------------------------------------------

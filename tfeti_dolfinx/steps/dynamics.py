@@ -161,8 +161,9 @@ class Predictor:
         if self._dual is not None:
             self._dual.destroy()
             self._subdomains.retrace(constraints.trace)
-        parts = constraints, self._subdomains, dofs
-        self._dual, self._options = settings.make_dual(*parts, _frictionless)
+        self._dual, self._options = settings.make_dual(
+            constraints, self._subdomains, dofs, _frictionless
+        )
 
     def _solve(self, gluing: Gluing) -> Array:
         """Return the displacement in primal order."""
