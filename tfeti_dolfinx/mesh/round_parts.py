@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -40,6 +41,8 @@ class RoundParameters:
     gains: float = 1.08
     loses: float = 0.93  # and below which it loses none; between the two sizes are balanced
     bits: int = 20  # of the whole numbers that midpoints become along each axis
+    # points of a group, large and small, for which parts are left out together
+    groups: tuple[int, int] = (64, 8)
 
 
 ROUND = RoundParameters()
@@ -58,7 +61,7 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     if np.all(shares == 1):
         return body
     extents = mesh.extents()
-    flat = np.any(BISECTION.flat * extents <= extents.max(axis=1, initial=0.0)[:, None], axis=1)
+    flat = BISECTION.flat * extents.min(axis=1, initial=np.inf) <= extents.max(axis=1, initial=0.0)
     boxes = 2 * sizes_of(body[flat], len(sizes), comm) > sizes
     boxes |= (sizes < ROUND.fewest * shares) | (shares == 1)
     # integers, so that sums do not depend on how ranks share the points
@@ -103,24 +106,26 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
     beginning. Return the part of each point.
     """
     home = np.repeat(np.arange(len(shares)), shares)
-    total, (n, gdim) = int(sizes_of(body, len(shares), comm).sum()), x.shape
+    total, gdim = int(sizes_of(body, len(shares), comm).sum()), x.shape[1]
     centre = np.zeros((len(home), gdim))
-    apart = 2.0 ** (ROUND.bits + 2)  # bodies are along one more axis
-    tree = cKDTree(np.column_stack((centre, apart * home)))
+    # points of a body follow each other, in it those near each other
+    order = cKDTree(x, ROUND.groups[-1], compact_nodes=False, balanced_tree=False).indices
+    order = order[np.argsort(body[order], kind="stable")]
+    x, key, body = x[order], key[order], body[order]
     for stage, (sample, rounds, way) in enumerate(ROUND.stages):
-        some: Array = np.arange(n)
+        some: Array = np.arange(len(x))
         if sample * len(home) < total:
             some = np.flatnonzero(key % np.uint64(total // (sample * len(home))) == 0)
         y, of = x[some], body[some]
+        groups = _Groups(y, of)
         if stage == 0:
             own = bisect_points(y, shares, comm, body=of)
             centre = _means(y, own, centre, comm)
-            away = np.rint(np.sqrt(_squares(y, centre[own])))
+            away = np.rint(np.sqrt(_squares(y.T, centre[own].T)))
             spread = summed(comm, sum_rows(own, away, len(home)))
             influence = np.maximum(spread / np.maximum(sizes_of(own, len(home), comm), 1), 1.0)
         else:
-            own = tree.query(np.column_stack((y, apart * of)))[1].astype(np.int64)
-            own = _nearest(y, own, centre, influence, home)
+            own = groups.nearest(centre, influence, shares)
         goal = (sizes_of(of, len(shares), comm) / shares)[home]
         for _ in range(rounds):
             size = np.maximum(sizes_of(own, len(home), comm), 1)
@@ -130,52 +135,92 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
                 break
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
-            tree = cKDTree(np.column_stack((centre, apart * home)))
+            # bodies are along one more axis
+            tree = cKDTree(np.column_stack((centre, 2.0 ** (ROUND.bits + 2) * home)))
             next_one = tree.query(tree.data, k=2)[0][:, 1]
             influence = np.minimum(influence, ROUND.influence * np.maximum(next_one, 1.0))
-            own = _nearest(y, own, centre, influence, home)
-    return own
+            own = groups.nearest(centre, influence, shares)
+    part = np.empty_like(own)
+    part[order] = own
+    return part
 
 
 def _means(x: Array, part: Array, before: Array, comm: MPI.Intracomm) -> Array:
     """Return the means of the parts; means of empty parts do not change."""
-    terms = np.column_stack((np.ones(len(x)), x))
-    sums = summed(comm, sum_rows(part, terms, len(before)))
+    sums = summed(comm, sum_rows(part, np.vstack((np.ones(len(x)), x.T)).T, len(before)))
     size = sums[:, :1]
     return np.where(size > 0, sums[:, 1:] / np.maximum(size, 1.0), before)
 
 
-def _squares(x: Array, c: Array) -> Array:
-    """‖x − c‖², each in the same way wherever it stands."""
-    found = np.square(x[..., 0] - c[..., 0])
-    for k in range(1, x.shape[-1]):
-        found += np.square(x[..., k] - c[..., k])
+def _squares(x: Any, c: Any) -> Array:
+    """‖x − c‖² of coordinates along each axis, each in the same way wherever it stands."""
+    found: Array = x[0] - c[0]
+    found *= found
+    for k in range(1, len(x)):
+        apart = x[k] - c[k]
+        apart *= apart
+        found += apart
     return found
 
 
-def _nearest(x: Array, part: Array, centre: Array, influence: Array, home: Array) -> Array:
-    """Return the part of its body with the least ‖x − c_k‖/w_k for each point.
+class _Groups:
+    """Points in small groups, and these in large ones, each of one body.
 
-    By the triangle inequality no other part j can have a point of part i with
-    ‖x − c_i‖/w_i < ‖c_i − c_j‖/(w_i + w_j).
+    Points of a group follow each other, bodies too.
     """
-    found, small = part.copy(), part.astype(np.min_scalar_type(len(centre)))
-    order = np.argsort(small, kind="stable")  # of small integers by counting
-    size = np.bincount(part, minlength=len(centre))
-    present = np.flatnonzero(size)
-    bound = np.sqrt(_squares(centre[present][:, None], centre))
-    bound /= influence[present][:, None] + influence
-    bound[(home[present][:, None] != home) | (present[:, None] == np.arange(len(home)))] = np.inf
-    away = np.sqrt(_squares(x, centre[part])) / influence[part]
-    for k, own, away_from in zip(
-        present, np.split(order, np.cumsum(size[present]))[:-1], bound, strict=True
-    ):
-        own = own[away[own] >= away_from.min()]
-        reach = 1.001 * away[own].max(initial=0.0)  # what rounding decides is the same on all ranks
-        joined = np.append(k, np.flatnonzero(away_from <= reach))
-        squares = _squares(x[own][:, None], centre[joined])
-        found[own] = joined[np.argmin(squares / influence[joined] ** 2, axis=1)]
-    return found
+
+    def __init__(self, x: Array, body: Array) -> None:
+        axes = np.ascontiguousarray(x.T)
+        number = np.arange(len(x)) - np.searchsorted(body, np.arange(body.max(initial=0) + 1))[body]
+        within, self._levels = body, list[tuple[Array, Array, Array]]()
+        for size in ROUND.groups:
+            begins = number % size == 0
+            start = np.flatnonzero(begins)
+            low, high = (of.reduceat(axes, start, axis=1) for of in (np.minimum, np.maximum))
+            # farther than the farthest point, by more than rounding to single precision
+            radius = 0.5 * np.sqrt(_squares(high, low)) + 2.0
+            around = (0.5 * (low + high)).astype(np.float32), radius.astype(np.float32)
+            self._levels.append((within[start], *around))
+            within = np.cumsum(begins) - 1
+        last = np.append(start[1:], len(x)) - 1
+        self._points = np.minimum(start[:, None] + np.arange(size), last[:, None])
+        self._x = [along[self._points] for along in axes]
+
+    def nearest(self, centre: Array, influence: Array, shares: Array) -> Array:
+        """Return the part of its body with the least ‖x − c_k‖/w_k for each point.
+
+        A group is looked at with those parts that may be nearest to a point of the ball around it.
+        """
+        start: Array = np.concatenate(([0], np.cumsum(shares)))
+        part: Array = np.arange(len(centre))
+        axes, w = centre.T, influence.astype(np.float32)
+
+        def pairs(of: Array) -> tuple[Array, Array, Array]:
+            count = np.diff(start)[of]
+            first = np.cumsum(count) - count
+            place = np.arange(count.sum()) + np.repeat(start[of] - first, count)
+            return count, first, part[place]
+
+        for within, middle, radius in self._levels:
+            count, first, part = pairs(within)
+            c = [along.astype(np.float32)[part] for along in axes]
+            away = np.sqrt(_squares([np.repeat(along, count) for along in middle], c))
+            off, of = np.repeat(radius, count), w[part]
+            least = np.repeat(np.minimum.reduceat((away + off) / of, first), count)
+            kept = np.flatnonzero(away - off <= least * of)
+            part, start = part[kept], np.searchsorted(kept, np.append(first, len(part)))
+        found = np.empty(self._points[-1:].max(initial=-1) + 1, dtype=np.int64)
+        found[self._points] = part[start[:-1], None]
+        several = np.flatnonzero(np.diff(start) > 1)
+        count, first, of = pairs(several)
+        group = np.repeat(several, count)
+        rows = [along.take(group, axis=0) for along in self._x]
+        squares = _squares(rows, [along[of, None] for along in axes])
+        squares /= np.square(influence[of])[:, None]
+        least = np.repeat(np.minimum.reduceat(squares, first), count, axis=0)
+        pair, point = np.divmod(np.flatnonzero(squares == least), squares.shape[1])
+        found[self._points[group[pair], point][::-1]] = of[pair][::-1]  # of equal ones the first
+        return found
 
 
 # --- Smoothing of interfaces between parts ----------------------------------------------------
@@ -193,7 +238,7 @@ def flatten_interfaces(graph: CellGraph, part: Array, key: Array, wanted: Array)
     n, num_parts, comm = graph.num_cells, len(wanted), graph.comm
     around = incidence(graph.vertices, graph.num_nodes + 1).T.tocsr()
     every = graph.with_ghosts(part.astype(np.int32))
-    near: Array = np.arange(n)
+    near = np.flatnonzero(np.any(every[graph.across] != every[:n, None], axis=1))
     for turn in range(ROUND.flattening):
         near = near[np.any(every[graph.across[near]] != every[near, None], axis=1)]
         own = every[near]
@@ -227,13 +272,14 @@ def _majority(
     ``around`` has the cells at each node, ``across`` those across a facet of each of these cells.
     """
     num_parts, own = int(every.max(initial=0)) + 1, every[cell]
-    nodes, place = np.unique(corners, return_inverse=True)
-    met = around[nodes]
-    met = csr_array((met.data, every[met.indices], met.indptr), shape=(len(nodes), num_parts))
+    seen = np.zeros(around.shape[0], dtype=bool)
+    seen[corners] = True
+    place = (np.cumsum(seen) - 1)[corners]
+    met = around[np.flatnonzero(seen)] @ incidence(every[:, None], num_parts)
     facets = incidence(every[np.column_stack((cell, across))], num_parts)
     facets.data[:] = np.column_stack((np.ones(len(cell)), across != cell[:, None])).ravel()
     facets.sum_duplicates()
-    counted = incidence(place.reshape(corners.shape), len(nodes)) @ met
+    counted = incidence(place, met.shape[0]) @ met
     counted = csr_array(counted.multiply(facets > 0) + ROUND.facet * facets)
     counted.sort_indices()
     is_own = counted.indices == np.repeat(own, np.diff(counted.indptr))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import create_mesh_in_place
@@ -64,7 +65,7 @@ def moved(
         table[every] = np.arange(len(every))
         nodes.append(every[table[every] == np.arange(len(every))])
         table[nodes[-1]] = np.arange(len(nodes[-1]))
-        place[own] = table[mesh.cells[own]]
+        place[own] = table[every].reshape(-1, place.shape[1])
     to, node = np.repeat(np.arange(len(nodes)), [len(of) for of in nodes]), np.concatenate(nodes)
     of_cells, of_nodes = Exchange(comm, rank), Exchange(comm, to)
     node_ids, first, merged = np.unique(
@@ -137,16 +138,23 @@ def tear(
     values = np.column_stack((subdomain, on_boundary))
     share, values = moved(untorn, ranks[subdomain], values, comm)
     subdomain, on_boundary = values[:, 0], values[:, 1:] > 0
-    order = np.argsort(share.cell_ids)
+    order = np.argsort(share.cell_ids, kind="stable")  # on one rank they often ascend
     small = subdomain[order].astype(np.min_scalar_type(len(body)))  # sorted by counting
     order = order[np.argsort(small, kind="stable")]
-    # nodes of the torn mesh: one copy for each subdomain
-    stride = max(len(share.node_ids), 1)
-    copies, torn = np.unique(
-        subdomain[order, None] * stride + share.cells[order], return_inverse=True
+    # nodes of the torn mesh: one copy for each subdomain. Corners are sorted by counting
+    of = np.bincount(subdomain, minlength=len(body)) * share.cells.shape[1]
+    corners = csr_array(
+        (np.arange(share.cells.size), share.cells[order].ravel(), np.append(0, np.cumsum(of))),
+        shape=(len(body), len(share.node_ids)),
     )
-    node, start = copies % stride, offset_of(comm, len(copies))
-    cells = start + torn.reshape(share.cells.shape)
+    corners = corners.tocsc().tocsr()
+    node, first = corners.indices, np.ones(share.cells.size, dtype=bool)
+    first[1:] = node[1:] != node[:-1]
+    first[corners.indptr[:-1][of > 0]] = True
+    cells = np.empty(share.cells.size, dtype=np.int64)
+    cells[corners.data] = np.cumsum(first) - 1
+    node, start = node[first], offset_of(comm, np.count_nonzero(first))
+    cells = start + cells.reshape(share.cells.shape)
     mesh = create_mesh_in_place(comm, cells, share.x[node], share.element)
     cell = order[np.asarray(mesh.topology.original_cell_index) - offset_of(comm, len(cells))]
     facets, tdim = cell_facets(mesh), mesh.topology.dim

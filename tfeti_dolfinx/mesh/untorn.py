@@ -135,13 +135,13 @@ class UntornMesh:
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        return np.stack([c.sum(axis=0) for c in self._corners()], axis=1) / self.vertices.shape[1]
+        return np.stack([c.sum(axis=0) for c in self._corners()]).T / self.vertices.shape[1]
 
     def extents(self) -> Array:
         """Sides of each cell's box along the axes, shape ``(n, gdim)``."""
-        return np.stack([np.ptp(c, axis=0) for c in self._corners()], axis=1)
+        return np.stack([np.ptp(c, axis=0) for c in self._corners()]).T
 
     def _corners(self) -> Iterator[Array]:
         """Give one coordinate after the other of the vertices, shape ``(vertices_per_cell, n)``."""
-        vertices = self.vertices.T
+        vertices = np.ascontiguousarray(self.vertices.T)
         yield from (np.ascontiguousarray(c)[vertices] for c in self.x.T)
