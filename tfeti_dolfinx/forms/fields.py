@@ -9,6 +9,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
+from scipy.sparse import csr_array
 from ufl.algorithms.analysis import extract_arguments, extract_coefficients, extract_constants
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
@@ -140,11 +141,12 @@ def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     form = fem.form(ufl.TestFunction(DG0) * ufl.dx(metadata={"quadrature_degree": 2}))
     volume = fem.assemble_vector(form).array[np.asarray(DG0.dofmap.list)[:, 0]]
     cells = np.asarray(function.function_space.dofmap.list)
-    weight = np.repeat(volume, cells.shape[1])[:, None]
     values = function.x.array.reshape(-1, function.function_space.dofmap.index_map_bs)
     layout = np.asarray(in_cells.function_space.dofmap.list).ravel()
-    terms = in_cells.x.array.reshape(-1, values.shape[1])[layout] * weight
-    sums = sum_rows(cells.ravel(), np.hstack((terms, weight)), dofs.num_nodes)
+    weights = np.repeat(volume, cells.shape[1]), cells.ravel(), np.arange(cells.size + 1)
+    summing = csr_array(weights, shape=(cells.size, dofs.num_nodes)).T
+    terms = in_cells.x.array.reshape(-1, values.shape[1])[layout]
+    sums = np.column_stack((summing @ terms, summing @ np.ones(cells.size)))
     sums = dofs.spread(dofs.reduce(sums[dofs.dolfinx_node], np.add))
     values[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
     return function
