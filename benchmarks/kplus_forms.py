@@ -207,6 +207,8 @@ def draw(path, tables):
                 errors = column(of, "error of a deformation")
                 lines[kind] = column(of, "condition of the factor"), errors
             curves(panel, title, ("condition of what is factored", "relative error"), lines)
+            for line in panel.lines:  # other fixing nodes: no curve
+                line.set_linestyle("none")
 
 
 def main(argv):

@@ -340,11 +340,17 @@ def curves(
 
 
 def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
-    """Numbers as they are on a logarithmic axis: those given if few and short, or 1, 2, 5, ..."""
+    """Numbers as they are on a logarithmic axis: those given if few and short, or 1, 2, 5, ...
+
+    Of a horizontal axis of more than two decades, another one of more than three, 1, 10, 100, ...
+    """
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
     short = ticks is not None and max(ticks) < 1000 and len(ticks) <= FEW
-    axis.set_major_locator(FixedLocator(ticks) if short else LogLocator(subs=(1.0, 2.0, 5.0)))
+    low, high = axis.get_data_interval()
+    wide = high > (1e2 if axis.axis_name == "x" else 1e3) * low
+    few = LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0))
+    axis.set_major_locator(FixedLocator(ticks) if short else few)
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 

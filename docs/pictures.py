@@ -1,13 +1,15 @@
 """Draw the pictures of the documents anew.
 
-    ./run python3 docs/pictures.py [NAME ...]
+    ./run python3 docs/pictures.py [--at COMMIT] [NAME ...]
 
 A name is that of a demo, or of a picture of a benchmark; without one all are drawn, which takes an
 hour or more. Demos draw at their default sizes; of what they draw those pictures are taken that are
-in docs/pictures, so a new one is put there by hand. Benchmarks put their tables into the pages,
-too. peers.png needs the other programs: benchmarks/peers/compare.py draws it.
+in docs/pictures, so a new one is put there by hand. Benchmarks put their tables into the pages, as
+measured at the commit; without one they are left out. peers.png needs the other programs:
+benchmarks/peers/compare.py draws it.
 """
 
+import argparse
 import shutil
 import subprocess
 import sys
@@ -28,22 +30,16 @@ BENCHMARKS = {
 }
 
 
-def commit() -> str:
-    """Return the commit that is measured."""
-    command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-
-def main(names: list[str]) -> None:
+def main(names: list[str], commit: str | None) -> None:
     """Run demos and benchmarks, all by default, and replace their pictures."""
     demos = {path.stem: path for path in sorted((ROOT / "demos").glob("[a-z]*.py"))}
-    for name in names or [*demos, *BENCHMARKS]:
+    for name in names or [*demos, *(BENCHMARKS if commit else ())]:
         program, *given = BENCHMARKS.get(name, [name, "--plot", *SIZES.get(name, [])])
         if name in BENCHMARKS:
-            given += ["--document", commit()]
+            given += ["--document", commit] if commit else []
         with TemporaryDirectory() as folder:
             path = demos.get(name, ROOT / f"benchmarks/{program}.py")
-            command = [sys.executable, path, *given, "--output", folder]
+            command = [sys.executable, str(path), *given, "--output", folder]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
             for drawn in sorted(Path(folder).glob(f"{program}*.[gp][in][fg]")):
                 known = PICTURES / (f"{name}.png" if name in BENCHMARKS else drawn.name)
@@ -53,4 +49,8 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="demos, pictures of benchmarks")
+    parser.add_argument("--at", metavar="COMMIT", help="commit that benchmarks measure")
+    arguments = parser.parse_args()
+    main(arguments.names, arguments.at)
