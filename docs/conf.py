@@ -12,11 +12,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import MISSING, fields, is_dataclass
+from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from sphinx.application import Sphinx
 from sphinx.util.inspect import TypeAliasForwardRef
@@ -280,6 +282,43 @@ def write_root_page(app: Sphinx, error: Exception | None) -> None:
         )
 
 
+class Page(HTMLParser):
+    """Collect the links of a page, and what links may lead to in it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.links, self.anchors = set[str](), {""}
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Take note of the attributes of a tag."""
+        self.anchors |= {value for key, value in attrs if key in ("id", "name") and value}
+        self.links |= {value for key, value in attrs if key in ("href", "src") and value}
+
+
+def follow_links(app: Sphinx, error: Exception | None) -> None:
+    """Raise an error if a link of the site leads nowhere; others' pages are not asked."""
+    if error is not None or app.builder.format != "html":
+        return
+    root = Path(app.outdir).resolve()
+    files = [path for path in root.rglob("*.html") if "_static" not in path.parts]
+    pages = {path: Page(path) for path in files}
+    lost = []
+    for path, page in pages.items():
+        for link in page.links:
+            address = urlsplit(link)
+            if address.scheme or address.netloc:
+                continue
+            target = (path.parent / unquote(address.path)).resolve() if address.path else path
+            anchors = pages[target].anchors if target in pages else {""}
+            if not target.exists() or (
+                target in pages and unquote(address.fragment) not in anchors
+            ):
+                lost.append(f"{path.relative_to(root)}: {link}")
+    if lost:
+        raise RuntimeError("links that lead nowhere:\n" + "\n".join(sorted(lost)))
+
+
 def setup(app: Sphinx) -> None:
     """Connect what is done before a build, to pages, and after it."""
     app.connect("builder-inited", write_examples)
@@ -290,3 +329,4 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-signature", shorten_signature)
     app.connect("html-page-context", mend_source_links)
     app.connect("build-finished", write_root_page)
+    app.connect("build-finished", follow_links)
