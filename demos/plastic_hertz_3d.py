@@ -18,6 +18,7 @@ parser = argparse.ArgumentParser(
 )
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--size", type=float, help="element size near the contact")
+parser.add_argument("--subdomains", type=int, help="their number")
 parser.add_argument("--plot", action="store_true", help="draw pictures")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
@@ -62,7 +63,7 @@ if comm.rank == 0:
     for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
     model.mesh.generate(3)
-subdomains = 2 if arguments.quick else 12
+subdomains = arguments.subdomains or (2 if arguments.quick else 12)
 decomposition = tfeti.read_gmsh(model if comm.rank == 0 else None, comm, subdomains)
 gmsh.finalize()
 # -
