@@ -108,22 +108,26 @@ def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1, roughly: float 
     It is the feasible point nearest to the forces of springs that gaps press. How many rows carry
     depends on how soft springs are, and that on how many carry: found by at most ``max_it`` turns,
     which balance the load up to the share ``roughly``, until these numbers differ by no more than
-    the share ``alike``. Where the least λ of Ω does not balance the load, it is that. Each
-    projection begins where the one before has ended, the first at the least λ of all. Collective.
+    the share ``alike``, from the least λ of Ω on. Where that does not balance the load, it is
+    that. A projection begins where the last has ended, the first at the least λ of all. Collective.
     """
-    zero, whole = np.zeros(len(qp.d)), qp.coarse.solve(qp.coarse.e)
-    lightest, alpha = project_onto_feasible(qp.coarse, qp.feasible, zero, whole)
-    if qp.foundation is None or imbalance(qp.coarse, lightest) > UNBALANCED:
-        return lightest
-    count, turn = 1, ProjectionParameters(balanced=roughly)
+    whole = qp.coarse.solve(qp.coarse.e)
+    lam, alpha = project_onto_feasible(qp.coarse, qp.feasible, np.zeros(len(qp.d)), whole)
+    if qp.foundation is None or imbalance(qp.coarse, lam) > UNBALANCED:
+        return lam
+
+    def carrying() -> int:
+        touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
+        return max(int(summed(qp.coarse.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
+
+    count, turn = carrying(), ProjectionParameters(balanced=roughly)
     for _ in range(max_it):
         springs, before = qp.foundation(count), count
         lam, alpha = project_onto_feasible(qp.coarse, qp.feasible, springs, alpha, turn)
-        touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
-        count = max(int(summed(qp.coarse.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
+        count = carrying()
         if abs(count - before) <= alike * before:
             break
-    return project_onto_feasible(qp.coarse, qp.feasible, springs, alpha)[0]
+    return project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count), alpha)[0]
 
 
 def feasible_start(qp: QP, start: Start) -> Array:

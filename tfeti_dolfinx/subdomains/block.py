@@ -103,8 +103,10 @@ def kernel_of(K: Any, modes: Array) -> Array:
     """
     U, s, _ = np.linalg.svd(modes, full_matrices=False)
     R0 = U[:, s > TOLERANCES.dependent * s.max(initial=0.0)]
-    R = R0 @ np.linalg.eigh(R0.T @ (K @ R0))[1]
-    energy = np.sum(R * (K @ R), axis=0)
+    KR0 = K @ R0
+    turn = np.linalg.eigh(R0.T @ KR0)[1]
+    R = R0 @ turn
+    energy = np.sum(R * (KR0 @ turn), axis=0)
     # In flat cells entries are differences of far larger numbers, which are as large as those that
     # other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
     largest = np.maximum.reduceat(K.diagonal()[K.indices], K.indptr[:-1])
