@@ -8,7 +8,7 @@ from meshes.tools import started_model, torn
 CORE, PIN, EDGE = 4.0, 10.0, 20.0
 
 
-def build(sizes, clearance=0.05, turn=0.1, thickness=0.0, layers=1, half=False):
+def build(sizes, clearance=0.05, turn=0.1, thickness=0.0, layers=1, half=False, thin=1.0):
     """Mesh pin and lug on this rank and return gmsh's model.
 
     Physical groups: the bodies "pin" and "lug"; the surfaces "pin side" (radius 10) and "core" of
@@ -20,15 +20,17 @@ def build(sizes, clearance=0.05, turn=0.1, thickness=0.0, layers=1, half=False):
         turn: Angle between the points where the arcs of both begin.
         thickness: Of pin and lug along z; 0 for a plane mesh.
         layers: Prisms across it, each cut into tetrahedra.
+        thin: Share of the thickness that the lug has.
         half: The right half alone, x ≥ 0; ``turn`` does not count.
     """
     model, geo = started_model("lug"), gmsh.model.geo
     bore, at, parts = PIN + clearance, 0.0 if half else turn, 2 if half else 4
     sides, radii = {}, {"pin": {"core": CORE, "pin side": PIN}, "lug": {"bore": bore, "edge": EDGE}}
     dim = 3 if thickness else 2
-    for name, size, begin in zip(radii, sizes, (0.0, at), strict=True):
+    thick = thickness, thin * thickness
+    for name, size, begin, along in zip(radii, sizes, (0.0, at), thick, strict=True):
         first = len(model.getEntities(0))
-        bodies = _body(radii[name], begin - np.pi / 2, parts, thickness, layers, sides)
+        bodies = _body(radii[name], begin - np.pi / 2, parts, along, layers, sides)
         geo.synchronize()
         model.mesh.setSize(model.getEntities(0)[first:], size)
         model.addPhysicalGroup(dim, bodies, name=name)

@@ -80,9 +80,7 @@ def test_a_pin_in_a_lug_with_curved_gaps(name):
     assert warning.endswith(EXPECTS)
     assert "change the gap, at most 0.05" in warning
     p = pin_in_lug(sizes, "curved", **mesh)
-    force, peak = force_and_peak(p) / reference()
-    assert abs(force / share - 1.0) < 0.01
-    assert abs(peak - 1.0) < far
+    assert np.all(np.abs(force_and_peak(p) / reference() / (share, 1.0) - 1.0) < (0.01, far))
     assert not p.report.warnings
 
 
@@ -94,6 +92,13 @@ def test_facets_that_miss_each_other_are_warned_of():
     assert any(text.startswith(SAYS) and "together by 0;" in text for text in p.report.warnings)
 
 
+def test_pressures_of_nodes_that_are_hardly_covered_do_not_hide_facets():
+    p = pin_in_lug((3.0, 2.0), thickness=6.0, layers=2, thin=0.53)  # the lug ends beyond a node
+    p.solve()
+    (warning,) = p.report.warnings
+    assert warning.startswith(SAYS)
+
+
 @pytest.mark.parametrize(
     ("sizes", "order", "gap"),
     [((3.0, 2.0), 2, "geometry"), ((3.0, 2.0), 1, CLEARANCE)],
@@ -101,9 +106,7 @@ def test_facets_that_miss_each_other_are_warned_of():
 )
 def test_facets_that_do_not_decide_are_not_warned_of(sizes, order, gap):
     p = pin_in_lug(sizes, gap, order)
-    force, peak = force_and_peak(p) / reference()
-    assert abs(force - 1.0) < 0.04
-    assert abs(peak - 1.0) < 0.06
+    assert np.all(np.abs(force_and_peak(p) / reference() - 1.0) < (0.04, 0.06))
     assert not p.report.warnings
 
 
@@ -117,9 +120,7 @@ def test_facets_do_not_show_at_an_obstacle(gap):
         return pushed_pin((size, 3.0), contact, order)
 
     p = pin(1.5, 1)
-    force, peak = force_and_peak(p) / force_and_peak(pin(0.75, 2))
-    assert abs(force - 1.0) < 0.02
-    assert abs(peak - 1.0) < 0.02
+    assert np.all(np.abs(force_and_peak(p) / force_and_peak(pin(0.75, 2)) - 1.0) < 0.02)
     assert not p.report.warnings
 
 
