@@ -10,7 +10,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from tfeti_dolfinx.common.arrays import TINY, Array, sum_rows
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, entries_of_rows, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, box_over_ranks, summed
 from tfeti_dolfinx.mesh.bisection import PARAMETERS as BISECTION
 from tfeti_dolfinx.mesh.bisection import bisect_points, sizes_of
@@ -191,35 +191,30 @@ class _Groups:
 
         A group is looked at with those parts that may be nearest to a point of the ball around it.
         """
-        start: Array = np.concatenate(([0], np.cumsum(shares)))
-        part: Array = np.arange(len(centre))
         axes, w = centre.T, influence.astype(np.float32)
-
-        def pairs(of: Array) -> tuple[Array, Array, Array]:
-            count = np.diff(start)[of]
-            first = np.cumsum(count) - count
-            place = np.arange(count.sum()) + np.repeat(start[of] - first, count)
-            return count, first, part[place]
-
+        part: Array = np.arange(len(centre))
+        near = Entries(w, part, np.concatenate(([0], np.cumsum(shares))), (len(shares), len(part)))
         for within, middle, radius in self._levels:
-            count, first, part = pairs(within)
+            entries, start = entries_of_rows(near, within)
+            part, count = near.indices[entries], np.diff(start)
             c = [along.astype(np.float32)[part] for along in axes]
             away = np.sqrt(_squares([np.repeat(along, count) for along in middle], c))
             off, of = np.repeat(radius, count), w[part]
-            least = np.repeat(np.minimum.reduceat((away + off) / of, first), count)
+            least = np.repeat(np.minimum.reduceat((away + off) / of, start[:-1]), count)
             kept = np.flatnonzero(away - off <= least * of)
-            part, start = part[kept], np.searchsorted(kept, np.append(first, len(part)))
+            near = near._replace(indices=part[kept], indptr=np.searchsorted(kept, start))
         found = np.empty(self._points[-1:].max(initial=-1) + 1, dtype=np.int64)
-        found[self._points] = part[start[:-1], None]
-        several = np.flatnonzero(np.diff(start) > 1)
-        count, first, of = pairs(several)
+        found[self._points] = near.indices[near.indptr[:-1], None]
+        several = np.flatnonzero(np.diff(near.indptr) > 1)
+        entries, start = entries_of_rows(near, several)
+        part, count = near.indices[entries], np.diff(start)
         group = np.repeat(several, count)
         rows = [along.take(group, axis=0) for along in self._x]
-        squares = _squares(rows, [along[of, None] for along in axes])
-        squares /= np.square(influence[of])[:, None]
-        least = np.repeat(np.minimum.reduceat(squares, first), count, axis=0)
+        squares = _squares(rows, [along[part, None] for along in axes])
+        squares /= np.square(influence[part])[:, None]
+        least = np.repeat(np.minimum.reduceat(squares, start[:-1]), count, axis=0)
         pair, point = np.divmod(np.flatnonzero(squares == least), squares.shape[1])
-        found[self._points[group[pair], point][::-1]] = of[pair][::-1]  # of equal ones the first
+        found[self._points[group[pair], point][::-1]] = part[pair][::-1]  # of equal ones the first
         return found
 
 
