@@ -12,6 +12,8 @@ import ufl
 from dolfinx import fem, la
 from mpi4py import MPI
 from scipy.sparse import csr_array
+from ufl.algorithms import expand_derivatives
+from ufl.corealg.traversal import unique_pre_traversal
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import assemble_csr, geometry_dofmap
@@ -23,6 +25,21 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 DEGREE = 4
 # of |J| |u|: a load less than this is its rounding, and that of F
 ROUNDING = 32.0 * float(np.finfo(float).eps)
+
+
+def dead_loads(F: ufl.Form, u: fem.Function) -> ufl.Form:
+    """Return those terms of F(u; v) that have neither u nor derivatives: loads that stay."""
+
+    def summands(e: Any) -> list[Any]:
+        parts = e.ufl_operands if isinstance(e, ufl.classes.Sum) else ()
+        return [term for part in parts for term in summands(part)] or [e]
+
+    def knows(x: Any) -> bool:
+        return isinstance(x, ufl.classes.Derivative) or x == u
+
+    terms = [(i, e) for i in expand_derivatives(F).integrals() for e in summands(i.integrand())]
+    dead = [(i, e) for i, e in terms if not any(map(knows, unique_pre_traversal(e)))]
+    return ufl.Form([i.reconstruct(integrand=e) for i, e in dead])
 
 
 class NewtonForms(Forms):
@@ -51,6 +68,8 @@ class NewtonForms(Forms):
         self._matrix: csr_array | None = None
         self._entries: la.MatrixCSR | None = None
         super().__init__(J, F, *as_forms)
+        dead = dead_loads(F, u)
+        self._dead = None if dead.empty() else self._compiled(dead, self.names[1])
 
     def changes(self, *kept: str) -> set[str]:
         """Return what is new, of J nothing where it is kept; a new J makes a new load."""
@@ -66,13 +85,23 @@ class NewtonForms(Forms):
         return self._matrix
 
     def load(self) -> Array:
-        """Return this rank's J u − F(u), 0 where it is rounding: that would drive free bodies."""
+        """Return this rank's J u − F(u), but for what is rounding: that would drive free bodies.
+
+        Loads that know nothing of u are no part of that: a small weight stays.
+        """
         assert self._matrix is not None  # stages make it before
-        u = self._u.x.array[: self._matrix.shape[1]]
+        u, dead = self._u.x.array[: self._matrix.shape[1]], self.dead()
         self.at_model = self.residual() if self.known is None else self.known
-        found = self._matrix @ u - self.at_model
+        found = self._matrix @ u - self.at_model + dead
         found[abs(found) <= ROUNDING * (abs(self._matrix) @ abs(u))] = 0.0
-        return np.asarray(found)
+        return np.asarray(found - dead)
+
+    def dead(self) -> Any:
+        """Return this rank's part of the residual that is of loads which know nothing of u."""
+        if self._dead is None:
+            return 0.0
+        with self._in_place():
+            return fem.assemble_vector(self._dead).array
 
     def tangent_times(self, d: Array) -> Array:
         """Return this rank's J(u) d."""
@@ -137,6 +166,10 @@ class InertialNewtonForms(NewtonForms):
         with self._in_place():
             pull = inertia.M @ (self._u.x.array - motion.towards)
         return 0.5 * (F - motion.load) + inertia.share * pull
+
+    def dead(self) -> Any:
+        """Return this rank's part of R(u) that is of loads at the end."""
+        return 0.5 * super().dead()
 
     def forces(self) -> Array:
         """Return this rank's −F(u): loads less stresses."""
