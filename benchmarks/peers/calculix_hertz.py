@@ -25,48 +25,54 @@ def rows(table):
     return "\n".join(", ".join(map(str, row)) for row in table)
 
 
-def deck(data, slope):
-    """The input of CalculiX."""
-    points, cells = data["points"], data["cells"]
-    n, m = len(points), len(cells)
-    a, R, E, nu = (float(data[name]) for name in ("a", "R", "E", "nu"))
-    up, wide = a**2 / (2 * R), WIDE * a
-    block = [(-wide, up - a), (wide, up - a), (wide, up), (-wide, up)]
-    tags, faces = np.arange(n + 1, n + 5), {}
-    for name in ("contact", "top"):
-        faces[name] = [(cell + 1, FACE[opposite]) for cell, opposite in data[f"{name} cells"]]
-    load = float(data["load"]) / length(data)
-    nodes = enumerate(np.concatenate((points, block)).tolist())
+def begin(nodes, cells, facets, tool, law, slope):
+    """A body, and a tool, one element whose type, nodes and pressing face are given."""
+    kind, face, tags = tool
+    n, m = len(nodes) - len(tags), len(cells)
+    places = enumerate(nodes.tolist())
     return f"""*NODE, NSET=ALL
-{rows((k + 1, f"{x:.12e}", f"{y:.12e}", 0.0) for k, (x, y) in nodes)}
-*ELEMENT, TYPE={"CPE3" if int(data["order"]) == 1 else "CPE6"}, ELSET=BODY
+{rows((k + 1, f"{x:.12e}", f"{y:.12e}", 0.0) for k, (x, y) in places)}
+*ELEMENT, TYPE={"CPE3" if cells.shape[1] == 3 else "CPE6"}, ELSET=BODY
 {rows(np.column_stack((np.arange(1, m + 1), cells + 1)))}
-*ELEMENT, TYPE=CPE4, ELSET=BLOCK
+*ELEMENT, TYPE={kind}, ELSET=TOOL
 {rows([[m + 1, *tags]])}
+*NSET, NSET=TOOL, GENERATE
+{n + 1}, {len(nodes)}
 *SURFACE, NAME=SLAVE, TYPE=ELEMENT
-{rows((cell, f"S{face}") for cell, face in faces["contact"])}
+{rows((cell + 1, f"S{FACE[opposite]}") for cell, opposite in facets)}
 *SURFACE, NAME=MASTER, TYPE=ELEMENT
-{m + 1}, S3
+{m + 1}, {face}
 *MATERIAL, NAME=STUFF
-*ELASTIC
-{E}, {nu}
+{law}
 *SOLID SECTION, ELSET=BODY, MATERIAL=STUFF
 1.
-*SOLID SECTION, ELSET=BLOCK, MATERIAL=STUFF
+*SOLID SECTION, ELSET=TOOL, MATERIAL=STUFF
 1.
 *SURFACE INTERACTION, NAME=TOUCH
 *SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR
-{slope * E / a:.6e}, 0.
+{slope:.6e}, 0.
 *CONTACT PAIR, INTERACTION=TOUCH, TYPE=SURFACE TO SURFACE
 SLAVE, MASTER
-*BOUNDARY
-{rows((node, 1, 2, 0.0) for node in tags)}
+"""
+
+
+def deck(data, slope):
+    """The input of CalculiX."""
+    n, cells = len(data["points"]), data["cells"]
+    a, R, E, nu = (float(data[name]) for name in ("a", "R", "E", "nu"))
+    up, wide = a**2 / (2 * R), WIDE * a
+    block = [(-wide, up - a), (wide, up - a), (wide, up), (-wide, up)]
+    tool, nodes = ("CPE4", "S3", np.arange(n + 1, n + 5)), np.concatenate((data["points"], block))
+    body = begin(nodes, cells, data["contact cells"], tool, f"*ELASTIC\n{E}, {nu}", slope * E / a)
+    load = float(data["load"]) / length(data)
+    return f"""{body}*BOUNDARY
+TOOL, 1, 2, 0.0
 {rows((node, 1, 1, 0.0) for node in np.unique(data["axis"]) + 1)}
 *STEP, INC=100
 *STATIC, SOLVER=SPOOLES
 1., 1.
 *DLOAD
-{rows((cell, f"P{face}", f"{load:.12e}") for cell, face in faces["top"])}
+{rows((cell + 1, f"P{FACE[opposite]}", f"{load:.12e}") for cell, opposite in data["top cells"])}
 *CONTACT FILE
 CDIS, CSTR
 *END STEP

@@ -124,13 +124,18 @@ def write(folder, commit=None):
     return finish(given, "peers", tables_of(folder), draw)
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
+def command_line(description):
+    """The options of programs that run others."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--quick", action="store_true", help="two coarse meshes")
     parser.add_argument("--output", type=Path, default=Path("results"), help="folder")
     parser.add_argument("--document", metavar="COMMIT", help="put the tables into docs/, too")
     parser.add_argument("--tables", action="store_true", help="of a folder of results, in ./run")
-    arguments = parser.parse_args()
+    return parser
+
+
+def main():
+    arguments = command_line(__doc__).parse_args()
     folder = arguments.output.resolve() / "peers"
     if arguments.tables:
         return write(folder, arguments.document)

@@ -20,6 +20,12 @@ def length(data: Any) -> float:
     return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum())
 
 
+def facets_on(on: Any) -> Any:
+    """Facets of triangles whose ends are on a surface: cells, and corners opposite."""
+    cells = np.flatnonzero(on.sum(axis=1) == 2)
+    return np.stack((cells, np.argmin(on[cells], axis=1)), 1)
+
+
 def processor(who: int) -> float:
     """Seconds of the processor of this process, or of those that it has waited for."""
     used = resource.getrusage(who)

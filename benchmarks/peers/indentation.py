@@ -1,0 +1,171 @@
+#!/usr/bin/env python3
+"""Seconds to a force in plasticity beside GetFEM and CalculiX: a wheel pressed into a block.
+
+    python3 benchmarks/peers/indentation.py [--quick] [--output DIR]      (not inside of ./run)
+
+J2 plasticity with linear hardening, small strain, plane strain, degree 2: a rigid parabola pressed
+into half of a block, clamped below, in eight steps; meshes that get finer, the same for all, in
+turns. Seconds are as in pressed_disc.py; reading its deck is in CalculiX'. GetFEM: its brick with
+return mapping, contact as in getfem_hertz.py; CalculiX: penalty as in calculix_hertz.py, 1000 E/a.
+"""
+
+import tempfile
+from pathlib import Path
+
+from compare import NAME
+from forces import main
+
+R, DEPTH, STEPS = 10.0, 0.002, 8
+E, NU, STRENGTH, HARDENING = 1.0, 0.3, 0.001, 0.05
+NEAR, SIZE = 0.25, 2.0  # half width of the equal elements, and of the block
+
+
+def block(n):
+    """Points and triangles, counterclockwise; n elements are equal, twice as many grow."""
+    import numpy as np
+
+    t = np.linspace(0.0, 3.0, 3 * n + 1)
+    x = NEAR * t + (SIZE - 3 * NEAR) * (np.maximum(t - 1.0, 0.0) / 2) ** 3
+    points = np.stack(np.meshgrid(x, -x[::-1], indexing="ij"), axis=2).reshape(-1, 2)
+    k = np.arange(len(points)).reshape(len(x), -1)
+    a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    return points, np.vstack((np.stack((a, b, c), 1), np.stack((a, c, d), 1)))
+
+
+def ours(points, cells):
+    """A solve that returns force, unknowns and steps of Newton's method; in ./run."""
+    import basix.ufl
+    import numpy as np
+    import ufl
+    from dolfinx import fem
+    from dolfinx import mesh as dmesh
+    from mpi4py import MPI
+
+    import tfeti_dolfinx as tfeti
+
+    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
+    body = dmesh.create_mesh(MPI.COMM_WORLD, cells=cells.astype(np.int64), x=points, e=element)
+    at = {"top": (1, 0.0), "bottom": (1, -SIZE), "axis": (0, 0.0)}
+    sides = {name: lambda x, k=k, c=c: np.isclose(x[k], c) for name, (k, c) in at.items()}
+    shape = tfeti.SignedDistance(
+        lambda x: x[0] ** 2 / (2 * R) - x[1],
+        lambda x: np.stack((x[0] / R, -np.ones_like(x[0]))) / np.hypot(x[0] / R, 1.0),
+    )
+    depths = DEPTH * np.arange(1, STEPS + 1) / STEPS
+
+    def solve(steps=STEPS):
+        d = tfeti.decompose(body, max(len(cells) // 600, 1), surfaces=sides)
+        V = fem.functionspace(d.mesh, ("Lagrange", 2, (2,)))
+        u, v, w = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+        bcs = []
+        for name, k in (("axis", 0), ("bottom", 0), ("bottom", 1)):
+            held = fem.locate_dofs_topological(V.sub(k), 1, d.facets(name))
+            bcs.append(fem.dirichletbc(0.0, held, V.sub(k)))
+        elastic = tfeti.Elasticity(d, E=E, nu=NU, model="plane_strain")
+        steel = tfeti.J2Plasticity(elastic, u, yield_stress=STRENGTH, hardening=HARDENING)
+        given = {"J": steel.tangent(w, v), "state": steel.state, "update": steel.update}
+        given["petsc_options"] = {"tfeti_rtol": 1e-4}
+        wheel = tfeti.Obstacle("top", shape, displacement=lambda depth: (0.0, -depth))
+        problem = tfeti.NonlinearContactProblem(steel.residual(v), u, bcs, [wheel], d, **given)
+        records = tfeti.LoadSteps(problem, lambda problem, depth: None, depths[:steps]).run()
+        force = problem.solution.reaction("bottom").force[1]
+        did = sum(record.figures["newton_steps"] for record in records)
+        return abs(float(force)), V.dofmap.index_map.size_global * 2, did
+
+    solve(1)  # compiles forms
+    return solve
+
+
+def getfem(points, cells, r=1.0):
+    """The same by GetFEM; in benchmarks/peers/run."""
+    import getfem as gf
+    import numpy as np
+    from getfem_body import Body
+    from judged import facets_on
+
+    body = Body(points[cells], facets_on(np.isclose(points[:, 1], 0.0)[cells]))
+    numbers = {"mu": E / 2 / (1 + NU), "lambda": E * NU / (1 + NU) / (1 - 2 * NU), "H_k": 0.0}
+    numbers |= {"sigma_y": STRENGTH, "H_i": HARDENING, "r": r * E / NEAR}
+    law = ["plane strain Prandtl Reuss linear hardening", 0, "u", "xi", "Previous_Ep"]
+    law += ["Previous_alpha", "lambda", "mu", "sigma_y", "H_k", "H_i", "1", "timestep"]
+
+    def solve():
+        x, y, across = body.begin(**numbers)
+        model = body.model
+        model.add_fem_data("Previous_u", body.space(2, 2))
+        for name, shape in (("xi", [1]), ("Previous_xi", [1]), (law[5], [1]), (law[4], [2, 2])):
+            model.add_im_data(name, gf.MeshImData(body.im, -1, shape))
+        model.set_time_step(1.0)
+        model.add_small_strain_elastoplasticity_brick(body.im, *law)
+        low = np.isclose(y, -SIZE)
+        held = np.flatnonzero(low | (np.isclose(x, 0.0) & ~across))
+        body.hold(held)
+        distance, places = body.touch(lambda x, y: x**2 / (2 * R) - y, 2)
+        steps = 0
+        for step in range(1, STEPS + 1):
+            model.set_variable("obstacle", distance - DEPTH * step / STEPS)
+            steps += body.solved(1e-8)
+            model.small_strain_elastoplasticity_next_iter(body.im, *law)
+        force = model.variable("held")[(low & across)[held]].sum()
+        return abs(float(force)), len(x) + len(places), steps
+
+    return solve
+
+
+def deck(points, cells, slope=1e3):
+    """The input of CalculiX, and its unknowns; the wheel is one element, all of it prescribed."""
+    import numpy as np
+    from calculix_hertz import begin, rows
+    from judged import facets_on
+
+    edges = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    ends, middle = np.unique(edges, axis=0, return_inverse=True)
+    nodes = np.vstack((points, points[ends].mean(axis=1)))
+    numbered = np.hstack((cells, len(points) + middle.reshape(-1, 3)))
+    facets = facets_on(np.isclose(points[:, 1], 0.0)[cells])
+    x = SIZE * np.array([0.0, 1.0, 1.0, 0.0, 0.5, 1.0, 0.5, 0.0])
+    y = x**2 / (2 * R) + 0.1 * np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.5, 1.0, 0.5])
+    tool = "CPE8", "S1", len(nodes) + np.arange(1, 9)
+    law = f"*ELASTIC\n{E}, {NU}\n*PLASTIC\n{STRENGTH}, 0.\n{STRENGTH + HARDENING}, 1."
+    places = np.vstack((nodes, np.stack((x, y), 1)))
+    body = begin(places, numbered, facets, tool, law, slope * E / NEAR)
+    low, axis = (np.flatnonzero(np.isclose(nodes[:, k], at)) + 1 for k, at in ((1, -SIZE), (0, 0)))
+    words = f"""{body}*NSET, NSET=LOW
+{rows(low[:, None])}
+*BOUNDARY
+LOW, 1, 2, 0.0
+{rows((node, 1, 1, 0.0) for node in axis)}
+*STEP, INC=1000
+*STATIC, SOLVER=SPOOLES
+{1 / STEPS}, 1., 1e-5, {1 / STEPS}
+*BOUNDARY
+TOOL, 1, 1, 0.0
+TOOL, 2, 2, {-DEPTH}
+*NODE PRINT, NSET=LOW, TOTALS=ONLY, FREQUENCY=1000
+RF
+*END STEP
+"""
+    return words, nodes.size
+
+
+def calculix(points, cells):
+    """The same by CalculiX; in benchmarks/peers/run."""
+    from calculix_hertz import solved
+
+    words, unknowns = deck(points, cells)
+    job = Path(tempfile.mkdtemp()) / "job"
+    job.with_suffix(".inp").write_text(words)
+
+    def solve():
+        steps = solved(job).count(" iteration ")
+        force = job.with_suffix(".dat").read_text().split()[-2]
+        return abs(float(force)), unknowns, steps
+
+    return solve
+
+
+SIZES = (4, 8, 16, 24)  # elements of equal size near the wheel
+PROGRAMS = {NAME: ours, "GetFEM": getfem, "CalculiX": calculix}
+
+if __name__ == "__main__":
+    main(__file__, __doc__, "indentation", SIZES, block, PROGRAMS)
