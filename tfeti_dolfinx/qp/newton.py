@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import any_rank, largest, least, norm_over, summed
+from tfeti_dolfinx.common.parallel import any_rank, largest, least, norm_over, steering, summed
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
-from tfeti_dolfinx.qp.coarse import HELD, imbalance
+from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.problem import (
     QP,
@@ -150,11 +150,18 @@ def _multiple(qp: QP, lam: Array, nearest: Array) -> Array:
 
     It is where a load grows; else return that. Collective.
     """
-    coarse, held = qp.coarse, qp.coarse.G(lam)
-    grown = float(held @ coarse.e) / max(float(held @ held), TINY) * lam
+    grown = growth(qp.coarse, lam) * lam
     way, shortest = qp.dot((grown - lam, grown - lam), (nearest - lam, nearest - lam))
-    leaves = any_rank(coarse.comm, qp.feasible.project(grown) != grown)
-    return nearest if way > 4.0 * shortest or leaves or imbalance(coarse, grown) > HELD else grown
+    leaves = any_rank(qp.coarse.comm, qp.feasible.project(grown) != grown)
+    leaves |= imbalance(qp.coarse, grown) > HELD
+    return nearest if way > 4.0 * shortest or leaves else grown
+
+
+def growth(coarse: Coarse, lam: Array) -> float:
+    """Return the c for which cλ balances the load, 1 if there is none. Collective."""
+    held = coarse.G(lam)
+    (c,) = steering(coarse.comm, float(held @ coarse.e) / max(float(held @ held), TINY))
+    return float(c) if c > 0.0 and imbalance(coarse, c * lam) <= HELD else 1.0
 
 
 def multipliers_at(qp: QP, z: Point) -> Array:

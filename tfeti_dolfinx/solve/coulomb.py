@@ -21,7 +21,7 @@ from tfeti_dolfinx.qp.friction_newton import (
     LawProgram,
     newton_on_law,
 )
-from tfeti_dolfinx.qp.newton import multipliers_at
+from tfeti_dolfinx.qp.newton import growth, multipliers_at
 from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, Point, QPResult, Steps
 from tfeti_dolfinx.solve.solver import solve_dual
 
@@ -115,7 +115,7 @@ def solve_with_friction(
         if result.reason <= 0:
             if law is not None:
                 newton.tries, dual.recycled, bounds.now = 0, newton.recycled, bounds.before
-            elif not bounds.slip(result.reason):
+            elif not bounds.turn(result.reason):
                 break
             law, holds = None, bounds.hold()
             if not holds:
@@ -178,7 +178,7 @@ class FrictionBounds:
         self._stuck, self._slipped = start is None, False
         self.now: Array = np.full(len(self._rows), np.inf)
         if start is not None:
-            known = dual.pressures[at]
+            known = max(growth(dual.coarse, start[0]), 1.0) * dual.pressures[at]
             lost = any_rank(self._comm, not np.all(np.isfinite(known)))
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
         self.before, self._found = self.now, self.now
@@ -207,11 +207,19 @@ class FrictionBounds:
         self._dual.bound_friction(self.now)
         return True
 
-    def slip(self, reason: ConvergedReason) -> bool:
-        """Let all slip where sticking contradicts itself, as beside a wall that pushes, once."""
-        if self._slipped or not self.stick or reason != ConvergedReason.DIVERGED_CONTRADICTION:
+    def turn(self, reason: ConvergedReason) -> bool:
+        """Let all slip where sticking contradicts itself, as beside a wall that pushes, once.
+
+        Or stick, where no forces within the bounds of an earlier step are found to balance a load,
+        as of one that was far smaller. Return whether there are other bounds.
+        """
+        contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
+        if contradicts and not self._slipped:
+            self.now, self._slipped = np.zeros(len(self._rows)), True
+            return True
+        if reason != ConvergedReason.DIVERGED_STALLED or self._stuck:
             return False
-        self.now, self._slipped = np.zeros(len(self._rows)), True
+        self.now, self._stuck = np.full(len(self._rows), np.inf), True
         return True
 
     def change(self, values: Array) -> float:
@@ -338,14 +346,14 @@ class NewtonOnLaw:
             rows.sets.tangents[at],
         )
         program = LawProgram(qp, law, dual.coarse.oblique, norm)
-        # Step 1: the start, with its μ or that of least squares: the lesser residual
+        # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
         Fx = dual.last.image(qp.F, qp.coarse.comm, start[0]).Fx
-        z = Point(start[0], Fx - qp.d)
-        known = start[1] if len(start[1]) == qp.coarse.dimension else multipliers_at(qp, z)
-        points = [
-            LawPoint(z.lam, z.g - qp.coarse.combined(mu), mu)
-            for mu in (known, qp.coarse.coordinates(z.g))
-        ]
+        points = []
+        for c in dict.fromkeys((1.0, growth(qp.coarse, start[0]))):
+            z = Point(c * start[0], c * Fx - qp.d)
+            known = start[1] if len(start[1]) == qp.coarse.dimension else multipliers_at(qp, z)
+            for mu in (known, qp.coarse.coordinates(z.g)):
+                points.append(LawPoint(z.lam, z.g - qp.coarse.combined(mu), mu))
         residuals = [program.natural_map(point)[2] for point in points]
         residual = min(residuals)
         first = points[residuals.index(residual)]
