@@ -54,6 +54,8 @@ SCENES = {
     "cube on springs": "cube_3d --subdomains 64 --springs 1e-2",
     "flat block 1 : 100": "ladder flat block, hexahedron, 100",
     "moduli of cells 1 : 1e6": "ladder cells, hexahedron, 1e6",
+    "three pairs of a node": "ladder pairs of a node, hexahedron, 3",
+    "the same, tetrahedra": "ladder pairs of a node, tetrahedron, 3",
 }
 # beside those of -tfeti_without what decompose and read_gmsh do by default
 KNOWN = {**MECHANISMS, "round_parts": "parts of round shape, not those of bisection"}

@@ -48,13 +48,19 @@ def rung(name, cell, value):
 
 
 @pytest.mark.parametrize(
-    ("name", "friendly", "hard", "times"),
-    [("Coulomb, moduli", 1.0, 1e4, 3.0), ("Coulomb, nu", 0.3, 0.499, 4.0)],
+    ("name", "cell", "friendly", "hard", "times"),
+    [
+        ("Coulomb, moduli", "hexahedron", 1.0, 1e4, 3.0),
+        ("Coulomb, nu", "hexahedron", 0.3, 0.499, 4.0),
+        ("pairs of a node", "hexahedron", 2, 3, 12.0),
+        ("pairs of a node", "tetrahedron", 2, 3, 12.0),
+    ],
 )
-def test_rubber_on_steel_with_friction_costs_a_few_times_the_friendly_pair(
-    name, friendly, hard, times, serial_only
+def test_a_hard_rung_costs_a_few_times_the_friendly_one(
+    name, cell, friendly, hard, times, serial_only
 ):
-    rows = [run_scene(rung(name, "hexahedron", v), MPI.COMM_WORLD) for v in (friendly, hard)]
+    rows = [run_scene(rung(name, cell, value), MPI.COMM_WORLD) for value in (friendly, hard)]
+    assert [row["class"] for row in rows] == ["right", "right"]
     few, many = (row["F"] for row in rows)
     assert many <= times * few
 

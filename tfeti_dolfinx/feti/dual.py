@@ -275,6 +275,7 @@ class Dual:
             seen=self.seen,
             recycled=self.recycled,
             keeps="kept_directions" not in self._without,
+            cautious="cautious" not in self._without,
             foundation=None if "foundation" in self._without else self.foundation,
         )
 

@@ -293,6 +293,8 @@ class NewtonIteration:
         )
         taken = feasible and 0.5 * double >= enough - self.parameters.hidden * hidden
         self.resume = taken
+        rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
+        self.solver.cautious = self.qp.cautious and rose and self.idle < 2
         if taken:
             self._go(end, 0.5 * double)
         if not taken and not looked:
@@ -332,6 +334,7 @@ class FaceSolver:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
+        cautious: Whether rows leave a flat face as they block, after a step in which q rose.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -350,6 +353,7 @@ class FaceSolver:
         self.directions.norm = qp.seen
         self._face: Face | None = None
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
+        self.cautious, self.rounds = False, 0
         self.excluding: Array | None = None
         self.left = np.inf
 
@@ -362,8 +366,9 @@ class FaceSolver:
         there, and goes on if the face stays. Return where PCPG ended on the last face, and whether
         that is in Ω and fulfils Gλ = e.
         """
-        z, stays = start, self._enter(face) and resume
+        z, stays, self.rounds = start, self._enter(face) and resume, 0
         while True:
+            self.rounds += 1
             # Step 3a: PCPG on the face; where F does not see a direction, along it past a bound
             end, broken = self._pcpg(z, optimality, stays)
             if broken and not self._has_left(end):
@@ -372,6 +377,9 @@ class FaceSolver:
             out, stays = self._has_left(end), False
             if not out or self._steps.cg >= self._max_it:
                 break
+            if self.cautious and not self._curved:
+                z = self._blocked(z, end)
+                continue
             if (restored := self._restored(end)) is None:
                 break
             z = restored
@@ -403,6 +411,15 @@ class FaceSolver:
             F, bend = qp.F, face.bend
             self._on_face = replace(self._on_face, F=lambda x: F(x) + bend(x), recycled=None)
         return same
+
+    def _blocked(self, z: Point, end: Point) -> Point:
+        """Go towards the end as far as the first bound, and enter the face there."""
+        qp, way = self._qp, end.lam - z.lam
+        length = min(least(qp.coarse.comm, qp.feasible.max_step(z.lam, -way)), 1.0)
+        on = qp.feasible.project(z.lam + length * way)
+        z = Point(on, z.g + length * (end.g - z.g))
+        self._enter(qp.feasible.face(on, z.g))
+        return z
 
     def _restored(self, end: Point) -> Point | None:
         """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e.
@@ -493,8 +510,7 @@ class FaceSolver:
         if self._curved:
             end.g = end.g - face.bend(end.lam - z.lam)
             own.norm = norm  # small circles bend far more than F does
-        ended = self._steps.cg >= self._max_it
-        return end, reason != ConvergedReason.CONVERGED_RTOL and not ended
+        return end, reason != ConvergedReason.CONVERGED_RTOL and self._steps.cg < self._max_it
 
 
 # --- Block Newton -----------------------------------------------------------------------------
@@ -576,7 +592,6 @@ def newton(
         elif not state.accept(end, feasible) or state.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_ROUNDING
         steps.outer, looks = steps.outer + 1, True
-    none = np.empty(0, dtype=np.int64)
     return QPResult(
         lam=state.z.lam,
         mu=state.mu,
@@ -588,5 +603,5 @@ def newton(
         reference=homogenised.reference,
         norm=solver.directions.norm,
         steps=steps,
-        excluding=none if solver.excluding is None else solver.excluding,
+        excluding=np.empty(0, np.int64) if solver.excluding is None else solver.excluding,
     )
