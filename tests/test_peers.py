@@ -2,7 +2,6 @@
 
 import importlib
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +9,10 @@ import pytest
 from benchmarks.error_scenes import SCENES
 from benchmarks.peers import compare, mesh_file
 
-PEERS = Path(__file__).resolve().parents[1] / "benchmarks" / "peers"
-
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_meshes_and_decks_are_those_of_the_scene(serial_only, tmp_path, monkeypatch, order):
-    monkeypatch.syspath_prepend(str(PEERS))
+    monkeypatch.syspath_prepend(str(compare.HERE))
     calculix = importlib.import_module("calculix_hertz")
     mesh_file.main(["4", str(order), str(tmp_path / "mesh.npz")])
     data = np.load(tmp_path / "mesh.npz")
@@ -29,9 +26,8 @@ def test_meshes_and_decks_are_those_of_the_scene(serial_only, tmp_path, monkeypa
         assert np.array_equal(np.sort(facets, axis=1), np.sort(cells[cell, :3], axis=1))
     deck = calculix.deck(data, 1e3)
     loads = [line.split(",") for line in deck.split("*DLOAD\n")[1].splitlines() if ", P" in line]
-    total = float(loads[0][2]) * calculix.length(data)
     assert len(loads) == len(data["top"])
-    assert total == pytest.approx(float(data["load"]))
+    assert float(loads[0][2]) * calculix.length(data) == pytest.approx(float(data["load"]))
     assert deck.count("\n*ELEMENT") == 2
 
 
@@ -55,31 +51,34 @@ def test_pressures_are_judged_at_equal_errors(serial_only, tmp_path):
         peer = {"program": "Peer", "seconds": 5.0 * size / 6, "points": x.tolist()}
         put(f"1_{size}_peer", {**peer, "values": (exact * (1.0 + error)).tolist()})
     put("2_6_peer", {"failed": "no convergence"})
-    found = compare.write(folder)
-    rows, equal = found["half cylinder"], found["half cylinder, seconds to an error"]
+    rows, equal = compare.write(folder).values()
     assert [row["program"] for row in rows] == [compare.NAME] * 2 + ["Peer"] * 2
     assert [row["pressure"] for row in rows] == pytest.approx([0.08, 0.001] * 2, rel=0.02)
     assert equal[1]["1.0%"] == pytest.approx(5.0 * equal[0]["1.0%"], rel=0.01)
     assert (tmp_path / "peers.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_pressed_disc_is_judged_by_its_force(serial_only, monkeypatch):
+PRESSED = ("pressed_disc", "quarter_disc", 8, 4.0 * np.sin(np.pi / 16.0), 0.2527)
+INDENTED = ("indentation", "block", 4, 4.0, 3.445e-4)
+
+
+@pytest.mark.parametrize(("name", "mesh", "n", "area", "finest"), [PRESSED, INDENTED])
+def test_a_peer_is_judged_by_its_force(serial_only, monkeypatch, name, mesh, n, area, finest):
     """A coarse mesh presses as hard as the finest of the page, but for 2 %."""
-    monkeypatch.syspath_prepend(str(PEERS))
-    disc, n, finest = importlib.import_module("pressed_disc"), 8, 0.2527
-    points, cells = disc.quarter_disc(n)
-    area = np.linalg.det(np.diff(points[cells], axis=1)) / 2
-    assert np.all(area > 0.0)
-    assert area.sum() == pytest.approx(n * np.sin(np.pi / (2 * n)) / 2)
-    force, _, _ = disc.ours(points, cells)()
+    monkeypatch.syspath_prepend(str(compare.HERE))
+    scene, forces = importlib.import_module(name), importlib.import_module("forces")
+    points, cells = getattr(scene, mesh)(n)
+    areas = np.linalg.det(np.diff(points[cells], axis=1)) / 2
+    assert areas.min() > 0.0
+    assert areas.sum() == pytest.approx(area)
+    force, _, _ = scene.ours(points, cells)()
     assert force == pytest.approx(finest, rel=0.02)
     rows = []
-    for program, off in zip(disc.PROGRAMS, (1e-5, -1e-5), strict=True):
-        made = {"program": program, "seconds": len(program), "force": force}
-        finer = {"seconds": 9 * len(program), "force": finest * (1.0 + off)}
+    for program, off in zip(("GetFEM", compare.NAME), (1e-5, -1e-5), strict=True):
+        made = {"program": program, "n": n, "seconds": len(program), "force": force}
+        finer = {"n": 2 * n, "seconds": 9 * len(program), "force": finest * (1.0 + off)}
         rows += [made, {**made, **finer}]
-    tables = disc.tables_of(rows)
-    errors = [row["error"] for row in tables["pressed half disc"]]
-    assert errors[1::2] == pytest.approx([1e-5, 1e-5], rel=1e-3)
-    seconds = [row["0.1%"] for row in tables["pressed half disc, seconds to an error"]]
-    assert seconds[0] / seconds[1] == pytest.approx(len(disc.NAME) / len("GetFEM"))
+    rows, table = forces.tables_of(rows, name).values()
+    assert [row["error"] for row in rows[1::2]] == pytest.approx([1e-5, 1e-5], rel=1e-3)
+    seconds = [row["0.1%"] for row in table]
+    assert seconds[0] / seconds[1] == pytest.approx(len("GetFEM") / len(compare.NAME))
