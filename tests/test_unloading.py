@@ -225,14 +225,17 @@ def test_a_body_brought_to_another_only_touches_it(cell, gap, friction):
 def test_a_series_comes_back_to_rest(cell, qp_type, rtol):
     """Slips count from step to step, but without pressure there is no friction."""
     scene = Scene(cell, "driven", "coulomb", qp_type=qp_type, rtol=rtol)
-    value = np.array([0.003] * (scene.gdim - 1) + [-0.01])
+    value = np.array([0.003, -0.0033, -0.01])[3 - scene.gdim :]
     for factor in (1.0, 0.0, -1.0, 0.0, 1e-12, 1.0, 0.0):
         u = scene.solve(0.0, factor * value)
         assert np.abs(u).max() <= 0.02 * max(abs(factor), 1e-12)
         scene.problem.accept()
     value[-1] = 0.0  # it only touches: what is left of no forces bounds no friction
-    assert scene.solve(0.0, value) == pytest.approx(np.tile(value, (len(u), 1)), abs=1e-5 * 0.003)
-    assert qp_type == "smalse" or scene.problem.report.F_multiplications <= 40
+    for factor in (1.0, 1.000001, 1.000002):  # nor is it solved for
+        u = scene.solve(0.0, factor * value)
+        assert np.abs(u - factor * value).max() <= 1e-5 * 0.003
+        assert qp_type == "smalse" or scene.problem.report.F_multiplications <= 40
+        scene.problem.accept()
     scene.problem.destroy()
 
 
@@ -269,10 +272,9 @@ def test_a_body_that_contact_alone_holds_comes_to_rest():
     for pressed in (0.05, 0.0, 1e-13, 0.05, 0.0):
         load.value[1] = -pressed
         problem.solve()
-        down = displacement(problem)[1][:, 1]
         # ε of plane strain under a pressure: (1 + ν)(1 − 2ν)/(1 − ν)/E would be held at both sides
         expected = -pressed * (1 - 0.3**2) - (gap if pressed else 0.0)
-        assert down.min() == pytest.approx(expected, rel=1e-5, abs=1e-18)
+        assert displacement(problem)[1][:, 1].min() == pytest.approx(expected, rel=1e-5, abs=1e-18)
     problem.destroy()
 
 
@@ -288,8 +290,7 @@ def test_what_sticks_has_not_slipped(friction, gap, qp_type, monkeypatch):
     for factor in (0.0, 1.0, 1e-4, 1e-12, 0.0):
         scene.problem.accept()
         u = scene.solve(0.0, factor * value)
-        allowed = 1e-4 * factor * np.abs(first).max() + 1e-15 * gap
-        assert np.abs(u - factor * first).max() <= allowed
+        assert np.abs(u - factor * first).max() <= 1e-4 * factor * np.abs(first).max() + 1e-15 * gap
         assert factor or scene.problem.report.F_multiplications <= 2
     scene.problem.destroy()
 

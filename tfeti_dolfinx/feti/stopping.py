@@ -72,6 +72,7 @@ class Measures:
     error: float  # norm of the correction in energy, over all bodies
     energy: float  # ‖u‖_K
     longest: float  # the longest of what rows miss, and of what closes that
+    effect: float  # ‖F‖‖λ‖: no displacement that forces make is larger
 
 
 def measure(
@@ -108,9 +109,9 @@ def measure(
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     d = dual.d
     held_d, held_F = (x[face.holding] for x in (d, state.residual + d))
-    squares = np.array([w @ w, held_d @ held_d, held_F @ held_F])
+    squares = np.array([x @ x for x in (w, state.lam, held_d, held_F)])
     comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-    residual, *sizes = np.sqrt(squares)
+    residual, multipliers, *sizes = np.sqrt(squares)
     # 2. its correction
     closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))
     v = min_norm_correction(constraints, w, closed)
@@ -148,6 +149,7 @@ def measure(
         error=float(np.sqrt(correction_energies.sum())),
         energy=float(np.sqrt(max(energies.sum(), 0.0))),
         longest=max(float(correction.max(initial=0.0)), float(largest[0])),
+        effect=norm * float(multipliers),
     )
 
 
@@ -242,7 +244,8 @@ class Accuracy(StoppingRule):
         self.look(lam, gradient, face, residual)
         given, now, before = self._limits, self.measures, self._before
         # 1. errors over their tolerances; forces of a body that falls far may be known better
-        # than the rounding of its fall allows
+        # than the rounding of its fall allows, but for those that move nothing beyond rounding
+        moves = now.effect > self._rounding
         stalled = False
         if before is not None and before.residual > 0.0:
             fell = (residual / self._claimed) ** given.stall
@@ -253,7 +256,7 @@ class Accuracy(StoppingRule):
             worst,
             worst if before is None else self.ratio(changes=False),
             self.measures.longest,
-            now.error / max(given.energy * self.rtol * now.energy, TINY),
+            moves * now.error / max(given.energy * self.rtol * now.energy, TINY),
             self._over_goal(),
             float(stalled),
         )
