@@ -31,8 +31,7 @@ from tfeti_dolfinx.qp.projection import (
 )
 from tfeti_dolfinx.qp.sets import Face, Status
 
-# least status of rows with friction
-RUBS = Status.STICK
+RUBS = Status.STICK  # least status of rows with friction
 
 
 @dataclass(frozen=True)
@@ -68,12 +67,11 @@ class NewtonParameters:
     rounding: float = 1e-10  # of the largest entry of a way: less is none
     hidden: float = 1e-15  # of the terms of q: what its differences may be wrong by
     short: float = 1e-6  # of a gradient: a projection that is shorter may be rounding
+    past: float = 1e-15  # of the way to a bound: so far past it, or rounding leaves a force there
     # of the way to the first bound, where no curvature ends it: more rows than one are to leave
     beyond: float = 10.0
-    # of ‖d‖: rows that want gaps so far apart exclude each other, less may be rounding
-    apart: float = 1e-8
-    # of the largest force of such a direction: rows with less have no part in it
-    takes_part: float = 1e-3
+    apart: float = 1e-8  # of ‖d‖: rows that want gaps so far apart exclude each other
+    takes_part: float = 1e-3  # of such a direction's largest force: rows with less have no part
     far: float = 1e30  # how far such a direction is followed, to end in Ω's cone of recession
     unseen: float = 1e-14  # of ‖F‖‖w‖: what may be left of Fw where F is not to see a direction w
     purifying: int = 200  # most steps of PCPG to that
@@ -413,10 +411,10 @@ class FaceSolver:
         return same
 
     def _blocked(self, z: Point, end: Point) -> Point:
-        """Go towards the end as far as the first bound, and enter the face there."""
+        """Go towards the end just past the first bound, and enter the face there."""
         qp, way = self._qp, end.lam - z.lam
         length = min(least(qp.coarse.comm, qp.feasible.max_step(z.lam, -way)), 1.0)
-        on = qp.feasible.project(z.lam + length * way)
+        on = qp.feasible.project(z.lam + (1.0 + self._parameters.past) * length * way)
         z = Point(on, z.g + length * (end.g - z.g))
         self._enter(qp.feasible.face(on, z.g))
         return z
