@@ -159,9 +159,10 @@ class FrictionBounds:
     """The λ_N that friction limits are taken from. All methods are collective.
 
     Without a start what touches sticks at first: that has a solution wherever any bounds have one.
+    So does what touches a body that nothing but friction may hold, and that has borne no force.
 
     Attributes:
-        now: The present ones, of each of ``constraints.pressed``; ∞: all points stick.
+        now: The present ones, of each of ``constraints.pressed``; ∞: the point sticks.
         body: The body on which they changed most at last, or that they do not hold; -1 before.
         before: Those before the last try of others.
         idle: Problems in a row whose change is not half of the least one before.
@@ -181,6 +182,7 @@ class FrictionBounds:
             known = max(growth(dual.coarse, start[0]), 1.0) * dual.pressures[at]
             lost = any_rank(self._comm, not np.all(np.isfinite(known)))
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
+            self.now = np.where(self._unknown(), np.inf, self.now)
         self.before, self._found = self.now, self.now
         self._none, self._best, self._length = 0.0, np.inf, 1.0
         self.idle, self.body, self._falls = 0, -1, 0
@@ -188,7 +190,7 @@ class FrictionBounds:
 
     @property
     def stick(self) -> bool:
-        """True if no bound is set yet, so that all points stick."""
+        """True if some bounds are not set yet, so that their points stick."""
         return any_rank(self._comm, np.isinf(self.now))
 
     def hold(self) -> bool:
@@ -294,6 +296,17 @@ class FrictionBounds:
     def forces_of(self, lam: Array, none: float = 0.0) -> Array:
         """Return the normal forces, those that are rounding or at most ``none`` set to 0."""
         return np.where(lam[self._rows] > max(self._none, none), lam[self._rows], 0.0)
+
+    def _unknown(self) -> Array:
+        """Return flags of rows on bodies whose forces tell nothing of the friction that holds them.
+
+        Bounds of 0 would leave motions free there that rounding drives.
+        """
+        coarse, rows = self._dual.coarse, np.zeros(self._constraints.num_rows, dtype=bool)
+        loose = np.any(coarse.unheld.free, axis=1) & (self._on_bodies(self.now) == 0.0)
+        rows[coarse.J.row[loose[coarse.J.body]]] = True
+        tangents = self._constraints.sets.tangents[self._constraints.pressed]
+        return np.any(rows[tangents], axis=1) & (self._mu > 0.0)
 
     def _on_bodies(self, pressures: Array) -> Array:
         """Return norms of the nodal forces μ times those of normals make on each body."""
