@@ -320,11 +320,9 @@ class ContactProblem:
         warnings = list[str]()
         if options.warnings:
             warnings = self._diagnostics.found(dual, solution, outcome, options.number)
-        method = f"{options.qp_type} + {options.pc_type}"
-        notes = notes_of(outcome, solution)
+        method, notes = f"{options.qp_type} + {options.pc_type}", notes_of(outcome, solution)
         self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
-        bodies = [*d.body_names, *self._system.tools.free_names]
-        restless = (bodies[settling.body], settling.slides)
+        restless = [*d.body_names, *system.tools.free_names][settling.body], settling.slides
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
         return solution, accuracy.tolerances().jump
 
@@ -473,8 +471,7 @@ class ContactProblem:
             return
         tools = self._system.tools
         tools.begin = [tools.pose(i) for i in range(len(tools))]
-        known = solution.gluing.records, solution.slip_at_end
-        self._system.count_slips_from(solution.u, known)
+        self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
         self._accepted = (solution, self._start)
 
     def go_back(self) -> None:
@@ -551,8 +548,7 @@ class ContactProblem:
         solution = self._make_solution(state.u, Multipliers(state.lam, face), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
-        known = solution.gluing.records, solution.slip_at_end
-        self._system.count_slips_from(solution.u, known)
+        self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
         self._go_on_from(state)
 
     # ------------------------------------- what bodies with mass and nonlinear ones add

@@ -233,6 +233,10 @@ class Decomposition:
         """Local facets of a surface, ascending."""
         return self.facet_tags.find(self.surface(name))
 
+    def cells(self, name: str | int) -> Array:
+        """Local cells of a volume, ascending."""
+        return self.cell_tags.find(self.volume(name))
+
     def locate_facets(self, marker: Callable[[Array], ArrayLike]) -> Array:
         """Return local facets of the true boundary whose vertices are marked. Collective.
 

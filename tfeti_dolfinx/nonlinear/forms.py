@@ -34,12 +34,13 @@ def dead_loads(F: ufl.Form, u: fem.Function) -> ufl.Form:
         parts = e.ufl_operands if isinstance(e, ufl.classes.Sum) else ()
         return [term for part in parts for term in summands(part)] or [e]
 
-    def knows(x: Any) -> bool:
-        return isinstance(x, ufl.classes.Derivative) or x == u
-
     terms = [(i, e) for i in expand_derivatives(F).integrals() for e in summands(i.integrand())]
-    dead = [(i, e) for i, e in terms if not any(map(knows, unique_pre_traversal(e)))]
-    return ufl.Form([i.reconstruct(integrand=e) for i, e in dead])
+    dead = [
+        i.reconstruct(integrand=e)
+        for i, e in terms
+        if not any(isinstance(x, ufl.classes.Derivative) or x == u for x in unique_pre_traversal(e))
+    ]
+    return ufl.Form(dead)
 
 
 class NewtonForms(Forms):

@@ -224,7 +224,7 @@ class NonlinearContactProblem(ContactProblem):
             plain = t < 1.0 or step == 0 or not (self._finite or forms.kept)
             if not plain:  # else the line search has ended there
                 self._set(faster.next(u, d))
-                if self._smallest_volume() <= 0.0:
+                if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
                     faster.forget()
                     self._set(u + d)
             forms.kept = keeping.next(size, t)
@@ -305,10 +305,6 @@ class NonlinearContactProblem(ContactProblem):
             with raised_on_all_ranks(self.decomposition.comm), named("update"):
                 self._update()
 
-    def _smallest_volume(self) -> float:
-        """Return the smallest det F; 1 in small strain. Collective."""
-        return 1.0 if self._places is None else self._places.smallest_volume_ratio()
-
     def _line_search(self, u: Array, d: Array) -> tuple[float, float]:
         """Go to u + t d, and return the length t in (0, 1] and |r(1)/r(0)|. Collective."""
         tol, at_u = self._tolerances, self._newton_forms.at_model
@@ -344,7 +340,7 @@ class NonlinearContactProblem(ContactProblem):
         t = 1.0
         while t >= self._tolerances.shortest:
             self._set(u + t * d)
-            if self._smallest_volume() > 0.0:
+            if self._places is None or self._places.smallest_volume_ratio() > 0.0:
                 slope = self._slope(u, d, t) + forces
                 if np.isfinite(slope):
                     return t, slope

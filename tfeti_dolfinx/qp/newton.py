@@ -133,26 +133,20 @@ def feasible_start(qp: QP, start: Start) -> Array:
 
     What was open stays open, if the others can restore Gλ = e: else each would carry a little.
     From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
-    has so many kinks that the projection may end before.
+    has so many kinks that the projection may end before. Where a load grows, cλ, whose image is
+    known, is in its place if it is feasible and about as near to λ.
     """
-    on = qp.feasible.project(start.lam)
+    lam, coarse = start.lam, qp.coarse
+    on = qp.feasible.project(lam)
     for within in (WithinFace(qp.feasible, qp.feasible.face(on, -on)), qp.feasible):
-        found, _ = project_onto_feasible(qp.coarse, within, start.lam)
-        if imbalance(qp.coarse, found) <= UNBALANCED:
-            return _multiple(qp, start.lam, found)
+        found, _ = project_onto_feasible(coarse, within, lam)
+        if imbalance(coarse, found) <= UNBALANCED:
+            grown = growth(coarse, lam) * lam
+            way, shortest = qp.dot((grown - lam, grown - lam), (found - lam, found - lam))
+            leaves = any_rank(coarse.comm, qp.feasible.project(grown) != grown)
+            leaves |= imbalance(coarse, grown) > HELD
+            return found if way > 4.0 * shortest or leaves else grown
     return first_point(qp)
-
-
-def _multiple(qp: QP, lam: Array, nearest: Array) -> Array:
-    """Return cλ, whose image is known, if it is feasible and about as near to λ as the nearest.
-
-    It is where a load grows; else return that. Collective.
-    """
-    grown = growth(qp.coarse, lam) * lam
-    way, shortest = qp.dot((grown - lam, grown - lam), (nearest - lam, nearest - lam))
-    leaves = any_rank(qp.coarse.comm, qp.feasible.project(grown) != grown)
-    leaves |= imbalance(qp.coarse, grown) > HELD
-    return nearest if way > 4.0 * shortest or leaves else grown
 
 
 def growth(coarse: Coarse, lam: Array) -> float:

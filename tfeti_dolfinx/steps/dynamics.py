@@ -16,7 +16,6 @@ from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.errors import InputError
@@ -30,7 +29,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.nonlinear.forms import InertialNewtonForms
 from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.qp.sets import FeasibleSet
 from tfeti_dolfinx.saved_state import SavedState
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
@@ -162,7 +160,10 @@ class Predictor:
             self._dual.destroy()
             self._subdomains.retrace(constraints.trace)
         self._dual, self._options = settings.make_dual(
-            constraints, self._subdomains, dofs, _frictionless
+            constraints,
+            self._subdomains,
+            dofs,
+            lambda rows: contact_set(replace(rows, limits=0.0 * rows.limits)),  # no friction
         )
 
     def _solve(self, gluing: Gluing) -> Array:
@@ -188,11 +189,6 @@ class Predictor:
             if item is not None:
                 item.destroy()
         self._M = self._dual = self._subdomains = None
-
-
-def _frictionless(constraints: Constraints) -> FeasibleSet:
-    """λ_N ≥ 0, and no force along tangents."""
-    return contact_set(replace(constraints, limits=0.0 * constraints.limits))
 
 
 # --- Newmark's method with contact ------------------------------------------------------------
