@@ -122,7 +122,8 @@ def strong(arguments, options):
     return tables
 
 
-# what is run, and the columns of its picture
+# what axes say of columns; then what is run, and the columns of its picture
+WORDS = {"F": "multiplications by F", "processor": "processor seconds of all ranks"}
 STUDIES = {
     "weak": (weak, (("subdomains", "F"), ("unknowns", "processor"))),
     "strong": (strong, (("ranks", "faster"),)),
@@ -142,7 +143,8 @@ def main(argv):
                     title.split(":")[0]: (column(rows, x), column(rows, y))
                     for title, rows in tables.items()
                 }
-                curves(panel, arguments.study, (x, y), lines, "x" if y == "F" else "xy")
+                log = "x" if y == "F" else "xy"
+                curves(panel, f"{arguments.study} scaling", (x, WORDS.get(y, y)), lines, log)
 
     return finish(arguments, f"scaling_{arguments.study}", run(arguments, options), draw)
 

@@ -331,7 +331,7 @@ def curves(
         axes.set_yscale("log")
         plain(axes.yaxis)
     else:
-        axes.set_ylim(0.0, 1.25 * max(max(y) for _, y in lines.values()))  # room for the legend
+        axes.set_ylim(0.0, 1.4 * max(max(y) for _, y in lines.values()))  # room for the legend
     axes.set_xlabel(labels[0])
     axes.set_ylabel(labels[1])
     axes.set_title(title, fontsize="medium")
