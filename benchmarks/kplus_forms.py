@@ -174,7 +174,7 @@ def row(kind, choice, beam, nodes):
     entry = {"K⁺": kind, "fixing nodes": choice}
     pinv = FORMS[kind](K, R, dofs)
     if kind == "regularized":
-        factored = condition(regular_matrix(K, R, dofs).toarray())
+        factored = condition(regular_matrix(K, R, dofs).csr().toarray())
         entry |= {"unknowns": len(dofs), "condition of the factor": factored, "condition of S": "-"}
     else:
         S, K_rr = schur_complement(K.toarray(), pinv.s)

@@ -142,7 +142,7 @@ def counted(solve):
     return calls["call"], matrices["made"]
 
 
-@pytest.mark.parametrize(("cell", "most"), [("triangle", 100), ("hexahedron", 150)])
+@pytest.mark.parametrize(("cell", "most"), [("triangle", 90), ("hexahedron", 145)])
 def test_a_solve_with_friction_makes_few_sparse_matrices(cell, most):
     scene = Repeated(cell, parts=8, friction=tfeti.Coulomb(0.3))
     assert max(scene.problem.decomposition.comm.allgather(counted(scene.solve)[1])) <= most
@@ -151,10 +151,10 @@ def test_a_solve_with_friction_makes_few_sparse_matrices(cell, most):
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_small_problems_take_few_calls_and_sparse_matrices(cell):
-    """A first solve makes 60 matrices at most, another load none, by 4500 calls of functions."""
+    """A first solve makes 55 matrices at most, another load none, by 4500 calls of functions."""
     scene = Repeated(cell, parts=8, qp_type="newton")
     most = 4500 if scene.problem.decomposition.comm.size == 1 else 7000  # ranks exchange
-    assert counted(scene.solve)[1] <= 60
+    assert counted(scene.solve)[1] <= 55
     calls, matrices = counted(lambda: scene.solve(load=-0.051))
     assert calls <= most
     assert matrices == 0

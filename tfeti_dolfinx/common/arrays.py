@@ -53,12 +53,6 @@ def entries_of_rows(A: Any, rows: Array) -> tuple[Array, Array]:
     return np.arange(table[-1]) + np.repeat(A.indptr[rows] - table[:-1], counts), table
 
 
-def rows_times(A: Any, factors: Array) -> csr_array:
-    """Return diag(factors) A of a CSR matrix, on the same table."""
-    data = A.data * np.repeat(factors, np.diff(A.indptr))
-    return csr_array((data, A.indices, A.indptr), shape=A.shape)
-
-
 class Entries(NamedTuple):
     """The arrays of a CSR matrix and its shape, as scipy's have them, by the same names."""
 
@@ -102,6 +96,21 @@ def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
     kept = column >= 0
     table = np.concatenate(([0], np.cumsum(kept)))[table]
     return Entries(A.data[entries[kept]], column[kept], table, (len(rows), len(columns)))
+
+
+def plus(A: Any, row: Array, column: Array, value: Array) -> Entries:
+    """Return A plus these entries, in the order of rows and of columns, as those of a CSR A are."""
+    rows, which = np.unique(row, return_inverse=True)
+    entries, begins = entries_of_rows(A, rows)
+    own = np.repeat(np.arange(len(rows)), np.diff(begins)) * A.shape[1] + A.indices[entries]
+    place = np.searchsorted(own, wanted := which * A.shape[1] + column)
+    new = np.searchsorted(own, wanted, side="right") == place
+    place += A.indptr[row] - begins[which]
+    data = np.insert(A.data, place[new], value[new])
+    data[(place + np.cumsum(new))[~new]] += value[~new]
+    indices = np.insert(A.indices, place[new], column[new])
+    table = A.indptr + np.searchsorted(row[new], np.arange(A.shape[0] + 1))
+    return Entries(data, indices, table, A.shape)
 
 
 def beside(A: Entries, B: Entries) -> Entries:

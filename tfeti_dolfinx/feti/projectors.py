@@ -10,7 +10,7 @@ from mpi4py import MPI
 from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
-from tfeti_dolfinx.common.arrays import TINY, Array, Entries, LocalMatrix, rows_of, transposed
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, LocalMatrix, plus, rows_of, transposed
 from tfeti_dolfinx.common.parallel import any_rank, joined_over, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
@@ -41,15 +41,12 @@ class Grams:
         parts = list(_blocks(Gt, bounded))
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
         reached = np.unique(joined_over(comm, own))
-        row = np.repeat(np.arange(size), np.diff(base.indptr))
-        known = row * size + base.indices
-        entries = np.union1d(known, reached)
-        row, column = np.divmod(entries, max(size, 1))
+        base.sort_indices()
+        whole = plus(base, *np.divmod(reached, max(size, 1)), np.zeros(len(reached)))
         # 2. where they stand
-        self._table = column, np.searchsorted(row, np.arange(size + 1))
-        self._base: Array = np.zeros(len(entries))
-        self._base[np.searchsorted(entries, known)] = base.data
-        self._reached = np.searchsorted(entries, reached)
+        self._base, self._table = whole.data, (whole.indices, whole.indptr)
+        row = np.repeat(np.arange(size), np.diff(whole.indptr))
+        self._reached = np.searchsorted(row * size + whole.indices, reached)
         self._blocks = [(rows, G, np.searchsorted(reached, pairs)) for rows, G, pairs in parts]
         everything = np.ones(Gt.shape[0], dtype=bool)
         self.whole = self.of_face(Face(everything, np.full(len(everything), Status.FREE)))
@@ -205,14 +202,9 @@ def _scaling(A: csr_array, null: NullModes) -> tuple[Array, Array]:
 def _scaled(A: csr_array, scale: Array, pinned: Array) -> Entries:
     """SAS + diag(pinned)."""
     A.sum_duplicates()
-    row = np.repeat(np.arange(len(scale)), np.diff(A.indptr))
-    values, stored = A.data * scale[row] * scale[A.indices], row == A.indices
-    values[stored] += pinned[row[stored]]
-    more = np.setdiff1d(np.flatnonzero(pinned), row[stored])
-    left = np.bincount(row[A.indices < row], minlength=len(scale))
-    at, before = (A.indptr[:-1] + left)[more], np.searchsorted(more, np.arange(len(A.indptr)))
-    indices = np.insert(A.indices, at, more)
-    return Entries(np.insert(values, at, pinned[more]), indices, A.indptr + before, A.shape)
+    data = A.data * np.repeat(scale, np.diff(A.indptr)) * scale[A.indices]
+    at = np.flatnonzero(pinned)
+    return plus(Entries(data, A.indices, A.indptr, A.shape), at, at, pinned[at])
 
 
 # --- Oblique projectors -----------------------------------------------------------------------

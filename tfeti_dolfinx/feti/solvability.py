@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import TINY, Array, rows_times
+from tfeti_dolfinx.common.arrays import TINY, Array, rows_of
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError, raised_on_all_ranks
@@ -239,7 +239,7 @@ def rigid_scene(
     over = size[sets.tangents]
     mu = constraints.coefficients * (over / size[constraints.pressed_by][:, None])
     along = [
-        [rows_times(J[sets.tangents[some, k]], w[some, k]) for k in range(sets.tangents.shape[1])]
+        [rows_of(J, at, of).csr() for at, of in zip(sets.tangents[some].T, w[some].T, strict=True)]
         for some, w in ((pressed, mu), (given, constraints.limits * over))
     ]
     presses = vstack([J[np.setdiff1d(sets.normals, above)], -J[pulling]], format="csr")

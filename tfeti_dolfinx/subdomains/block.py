@@ -9,9 +9,8 @@ from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
-from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix
 from tfeti_dolfinx.errors import InputError
 
 # --- Input of Blocks --------------------------------------------------------------------------
@@ -111,7 +110,7 @@ def kernel_of(K: Any, modes: Array) -> Array:
     # other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
     largest = np.maximum.reduceat(K.diagonal()[K.indices], K.indptr[:-1])
     sizes = np.sqrt(largest)[:, None] * np.abs(R)
-    pattern = csr_array((np.ones(len(K.data)), K.indices, K.indptr), shape=K.shape)
+    pattern = LocalMatrix(Entries(np.ones(len(K.data)), K.indices, K.indptr, K.shape))
     terms = np.sum(sizes * (pattern @ sizes), axis=0)
     return np.asarray(R[:, energy <= TOLERANCES.null * terms])
 

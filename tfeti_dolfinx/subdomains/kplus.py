@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, plus
 from tfeti_dolfinx.subdomains.block import candidate_modes
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
@@ -57,7 +57,7 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
 
 
 def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
-    """K_ρ, scipy CSR as K; K itself, maybe ``Entries``, where R has no columns.
+    """K_ρ without what is 0, of a scipy CSR K; K itself, maybe ``Entries``, where R has no columns.
 
     The fixing unknowns ascend.
     """
@@ -67,12 +67,12 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     # what moves in no motion may be far stiffer
     moves = np.abs(R).max(axis=1) > TOLERANCES.still * np.abs(R).max()
     added = K.diagonal()[moves].max() * (Q @ Q.T)
-    count = len(fixing_dofs)
-    table = np.zeros(K.shape[0] + 1, dtype=K.indptr.dtype)
-    table[fixing_dofs + 1] = count
-    columns = np.tile(fixing_dofs, count).astype(K.indices.dtype)
-    added = csr_array((added.ravel(), columns, np.cumsum(table, dtype=table.dtype)), shape=K.shape)
-    return K + added  # of scipy, which leaves out what is 0
+    row, column = (index.ravel() for index in np.meshgrid(fixing_dofs, fixing_dofs, indexing="ij"))
+    whole = plus(K, row, column, added.ravel())
+    if (kept := whole.data != 0.0).all():
+        return whole
+    table = np.concatenate(([0], np.cumsum(kept)))[whole.indptr]
+    return Entries(whole.data[kept], whole.indices[kept], table, K.shape)
 
 
 @dataclass
@@ -93,9 +93,9 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
     Raise a FactorError where it could not be found out, say for want of memory.
     """
     diagonal = K.diagonal()
-    shifted = regular_matrix(K, R, fixing_dofs) + diags_array(TOLERANCES.rounding * diagonal)
+    shifted = csr_array(K + diags_array(TOLERANCES.rounding * diagonal))
     try:
-        factor = CholeskyFactor(shifted, prefix)
+        factor = regularised(shifted, R, fixing_dofs, prefix)
     except NotPositiveDefiniteError:
         return "the stiffness is not positive semidefinite; expected a linear elastic form"
     if _gives_no_energy(K, R, x, factor):

@@ -258,7 +258,7 @@ class Subdomains:
             self._solves = solves_of(self.blocks, self.dof_parts)
         x = np.empty(len(b))
         for solve, dofs in self._solves:
-            x[dofs] = solve(b[dofs])
+            x[dofs] = solve(b[dofs]) if b[dofs].any() else 0.0  # most bear no load of their own
         return x
 
     @property
