@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import numpy as np
 from mpi4py import MPI
@@ -63,18 +63,12 @@ def raise_together(comm: MPI.Intracomm, error: Exception | None, raiser: int) ->
     """Raise the exception of the rank ``raiser`` on all ranks. Collective."""
     if comm.rank != raiser or error is None:
         raise comm.bcast(None, root=raiser)
-    portable = comm.bcast(_portable(error), root=raiser)
-    if type(portable) is type(error):
+    portable: Exception = TfetiError(f"{type(error).__name__}: {error}")
+    with suppress(Exception):  # whatever the error's own methods raise
+        rebuilt = pickle.loads(pickle.dumps(error))
+        if type(rebuilt) is type(error) and str(rebuilt) == str(error):
+            portable = error
+    comm.bcast(portable, root=raiser)
+    if portable is error:
         raise error
     raise portable from error
-
-
-def _portable(error: Exception) -> Exception:
-    """Return the error itself if other ranks can rebuild it, else a TfetiError that names it."""
-    try:
-        rebuilt = pickle.loads(pickle.dumps(error))
-    except Exception:  # whatever the error's own methods raise
-        rebuilt = None
-    if type(rebuilt) is type(error) and str(rebuilt) == str(error):
-        return error
-    return TfetiError(f"{type(error).__name__}: {error}")

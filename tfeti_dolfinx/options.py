@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -169,8 +170,8 @@ class Options:
 
     def view_text(self, prefix: str) -> str:
         """One line per option."""
-        known = parameters_of(Options)
-        return "\n".join(f"-{prefix}{option.name} {option.value_in(self)}" for option in known)
+        values = [(o.name, reduce(getattr, o.path, self)) for o in parameters_of(Options)]
+        return "\n".join(f"-{prefix}{name} {value}" for name, value in values)
 
 
 # --- Parsing of options -----------------------------------------------------------------------

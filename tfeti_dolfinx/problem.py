@@ -92,6 +92,8 @@ class ContactProblem:
     """
 
     form_name: ClassVar[str] = "a"
+    # input whose functions are not those of the solution
+    _unknown_before: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -241,11 +243,7 @@ class ContactProblem:
         self._solve_in_rounds()
 
     def _solve_in_rounds(self) -> None:
-        """Solve, with more and more contact rows, until no node without a row overlaps.
-
-        Raise a NoSolutionError where the problem has no solution, however far one looks; a
-        ConvergenceError where nodes without a row still overlap after many rounds.
-        """
+        """Solve, with more and more contact rows, until no node without a row overlaps."""
         system = self._system
         for _ in range(MAX_ROUNDS):
             try:
@@ -312,7 +310,7 @@ class ContactProblem:
         excluding = list[str]()
         if result.reason == ConvergedReason.DIVERGED_CONTRADICTION:
             excluding = system.search.named(gluing.contacts_of(result.excluding))
-        state, loose = accuracy.recovered, list[dict[str, object]]()
+        state, loose = accuracy.recovered, list[dict[str, Any]]()
         if options.warnings and state is not None:
             loose = dual.nearly_free(state.active)
         looks = of_looks(accuracy.reached)
@@ -408,9 +406,7 @@ class ContactProblem:
             conditions = None if values is None else listed_conditions(values)
             given |= {"load": load, "values": conditions, "stiffness": stiffness, "gap": gap}
         V, forms = self.dofs.V, copy(self._system.forms)
-        if conditions is None:
-            conditions = self.bcs
-        else:
+        if conditions is not None:
             check_conditions(conditions, V)
             check_not_on_tears(conditions, self.dofs)
         if stiffness is not None:
@@ -420,7 +416,8 @@ class ContactProblem:
             forms.replace_load(load)
         if gap is not None:
             self._system.set_gaps(gaps_by_position(self.contacts, gap))
-        self._system.forms, self.bcs[:] = forms, conditions
+        self._system.forms = forms
+        self.bcs[:] = self.bcs if conditions is None else conditions
 
     def digest(self) -> dict[str, Any]:
         """Describe what determines the solution, for checkpoints: short, and as JSON takes it.
@@ -433,7 +430,8 @@ class ContactProblem:
         comm, d = self.decomposition.comm, self.decomposition
         with agreeing(comm, "digest") as given:
             given |= self._given()
-        fields = fields_in(self._known_before(given))
+        known = {name: x for name, x in given.items() if name not in self._unknown_before}
+        fields = fields_in(known)
         mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
         sums = sums_of(comm, [d.mesh.geometry.x, *fields.values()])
         found = {name: described(value) for name, value in given.items()}
@@ -508,9 +506,8 @@ class ContactProblem:
         if dual.constraints is not start[0].constraints:
             return state
         state = replace(state, image=dual.last.known(self.dofs.comm, start[1]))
-        if dual.recycled is None:
-            return state
-        return replace(state, directions=dual.recycled.in_order())
+        kept = dual.recycled
+        return state if kept is None else replace(state, directions=kept.in_order())
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been. Collective.
@@ -564,10 +561,6 @@ class ContactProblem:
     def _set_out(self) -> None:
         """Set the prediction of a step; nothing without inertia."""
 
-    def _known_before(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Return that of the input whose functions are not those of the solution."""
-        return given
-
     def _check_state(self, state: SavedState) -> None:
         """Raise an InputError where a state is broken, or of something else. Not collective."""
         check_state(state, self.dofs, len(self.contacts))
@@ -581,10 +574,7 @@ class ContactProblem:
     # ------------------------------------------------------------------- checks
 
     def _meet(self, call: str) -> None:
-        """Begin a call: check that all ranks make it with the same data. Collective.
-
-        Raise an InputError where they do not, or the stress fails.
-        """
+        """Begin a call: check that all ranks make it with the same data. Collective."""
         with agreeing(self.decomposition.comm, call) as given:
             given |= self._given()
             self._look_at_stress()
@@ -596,13 +586,7 @@ class ContactProblem:
         return {**self._system.forms.given, **about, **elements}
 
     def _look_at_stress(self) -> Any:
-        """Return the user's stress of ``u`` in UFL, which solutions take until the next look.
-
-        Not collective: it is looked at where what it raises is raised on all ranks.
-
-        Raises:
-            InputError: As ``checked_stress``.
-        """
+        """Return the user's stress of ``u`` in UFL, which solutions take until the next look."""
         if self._given_stress is None:
             return None
         sigma = checked_stress(self._given_stress, self.u)

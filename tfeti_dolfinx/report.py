@@ -209,7 +209,7 @@ class Outcome:
     soft_modes: int = 0  # motions that springs hold softly, or all of clusters: preconditioned
     free_modes: int = 0  # rigid motions that nothing resists and the load does not drive
     # rigid motions that contacts with a force hold hardly or not (0): bodies, mode, stiffness
-    nearly_free: list[dict[str, object]] = field(default_factory=list)
+    nearly_free: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # why the answer cannot be trusted
     notes: list[str] = field(default_factory=list)  # what is worth knowing, and needs no change
     excluding_contacts: list[str] = field(default_factory=list)  # whose rows exclude each other
@@ -236,7 +236,7 @@ class Outcome:
         settling: FixedPointStatus,
         excluding: list[str],
         estimates: dict[str, float],
-        nearly_free: list[dict[str, object]],
+        nearly_free: list[dict[str, Any]],
     ) -> Self:
         """Measure an answer, warnings apart. Collective."""
         status, normals = solution.status_of_conditions, solution.gluing.constraints.sets.normals

@@ -328,6 +328,7 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
             f"the state is of {len(state.reach)} contacts; expected those of the problem, "
             f"{contacts}"
         )
+    found = dict[str, bool]()
     for f in fields(state):
         values, kind = getattr(state, f.name), OF.get(f.name)
         right = bool(np.all(np.isfinite(values)))
@@ -335,19 +336,14 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
             length = values.shape[1] if f.name == "directions" else len(values)
             wanted = len(getattr(state, kind)) * (dofs.bs if kind == "nodes" else 1)
             right &= length == wanted or (length == 0 and f.default_factory is not MISSING)
-        _check_broken(f.name, right)
-    _check_broken("secondary", len(state.secondary) == contacts)
+        found[f.name] = right
     nodes = labels_of_nodes(dofs)
-    _check_broken("nodes", same_labels(state.nodes, nodes))
-    _check_broken("contact", bool(np.all((state.contact >= 0) & (state.contact < contacts))))
-    own = np.isin(state.group, labels_of_groups(dofs, nodes))
-    _check_broken("group", bool(np.all(own)))
-
-
-def _check_broken(name: str, right: bool) -> None:
-    """Raise an InputError unless an array of a state is right."""
-    if not right:
+    found["secondary"] &= len(state.secondary) == contacts
+    found["nodes"] &= same_labels(state.nodes, nodes)
+    found["contact"] &= bool(np.all((state.contact >= 0) & (state.contact < contacts)))
+    found["group"] &= bool(np.all(np.isin(state.group, labels_of_groups(dofs, nodes))))
+    if broken := [name for name, right in found.items() if not right]:
         raise InputError(
-            f"the state is broken: {name} has another shape than in any solution of the problem, "
-            "or no numbers; expected what ContactProblem.state returned"
+            f"the state is broken: {broken[0]} has another shape than in any solution of the "
+            "problem, or no numbers; expected what ContactProblem.state returned"
         )

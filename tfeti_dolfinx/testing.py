@@ -120,10 +120,7 @@ def _check_face(face: Face, size: int) -> None:
 
 
 def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
-    """Moves along the face stay in the set, but for what its curvature bends them.
-
-    g is a gradient that pushes against the set at x and does nothing else, t coefficients.
-    """
+    """Moves along the face stay in the set, but for what its curvature bends; g only pushes."""
     face, short, long = feasible.face(x, g), TOLERANCES.short, TOLERANCES.long
     kappa = face.bends
     flat, pushing = kappa == 0.0, np.sqrt(abs(face.Z.sign()).T @ g**2)

@@ -225,10 +225,8 @@ class Diagnostics:
     def _facets(self, solution: Solution, subdomains: Subdomains) -> Iterator[str]:
         """Pairs of surfaces so alike that their straight facets decide where they meet.
 
-        What facets change of a gap is how far the smooth surfaces are apart where there is a force,
-        and how deep they overlap where there is none. It counts beside the distance by which the
-        largest pressure presses a node and what it meets into their surroundings, its force times
-        Σ_j w_ij²/K_jj.
+        What facets change of a gap counts beside the distance by which the largest pressure presses
+        a node and what it meets into their surroundings, its force times Σ_j w_ij²/K_jj.
         """
         records, comm = solution.gluing.records, self._dofs.comm
         flat = np.array([contact.gap == GEOMETRY for contact in solution.contacts])
@@ -304,7 +302,7 @@ def _loose(outcome: Outcome) -> Iterator[str]:
     weak = [motion for motion in outcome.nearly_free if motion["stiffness"]]
     for motion in weak[: LIMITS.listed]:
         yield (
-            f"{_bodies(motion)}: active contacts constrain {motion['mode']} weakly "
+            f"{', '.join(motion['bodies'])}: active contacts constrain {motion['mode']} weakly "
             f"({motion['stiffness']:.0e} of what they could): the displacement along it is poorly "
             "determined; add friction, a spring or a Dirichlet condition if it matters"
         )
@@ -314,26 +312,21 @@ def _loose(outcome: Outcome) -> Iterator[str]:
 
 def notes_of(outcome: Outcome, solution: Solution) -> list[str]:
     """Return what is worth knowing of an answer, whose displacement is right. Collective."""
-    of_meshes = *_hardly_covered(solution), *_overlapping(solution)
-    return [*_untouched(outcome, solution), *of_meshes, *_free(outcome)]
-
-
-def _untouched(outcome: Outcome, solution: Solution) -> Iterator[str]:
-    """Contacts none of which touches; given bounds of friction act all the same. Collective."""
+    found = list[str]()
     if outcome.contacts and not any(contact.touching for contact in outcome.contacts):
         gaps = [contact.gap for contact in outcome.contacts if contact.nodes]
         nearest = f" (smallest gap {min(gaps):.2g})" if gaps else ""
+        # given bounds of friction act all the same
         acts = any_rank(solution.dofs.comm, solution.condition_forces)
-        without = "the displacement is that without contacts"
-        yield f"no contact touches{nearest}: {'forces act across open gaps' if acts else without}"
+        says = (
+            "forces act across open gaps" if acts else "the displacement is that without contacts"
+        )
+        found.append(f"no contact touches{nearest}: {says}")
+    return [*found, *_hardly_covered(solution), *_overlapping(solution), *_free(outcome)]
 
 
 def _hardly_covered(solution: Solution) -> Iterator[str]:
-    """Pairs with large pressures on nodes that their primary side hardly covers. Collective.
-
-    A force on the common part has a right resultant, but hats on a sliver are nearly linear: the
-    forces on its vertices are large against their ∫φ_i on the sliver.
-    """
+    """Pairs with large pressures on slivers, whose ∫φ_i are small against forces. Collective."""
     records, count = solution.gluing.records, len(solution.contacts)
     if all(len(contact.surfaces) == 1 for contact in solution.contacts):
         return
@@ -372,7 +365,7 @@ def _free(outcome: Outcome) -> list[str]:
     loose = [motion for motion in outcome.nearly_free if not motion["stiffness"]]
     if not loose and not outcome.free_modes:
         return []
-    some = "; ".join(f"{_bodies(motion)}: {motion['mode']}" for motion in loose[: LIMITS.listed])
+    some = "; ".join(f"{', '.join(m['bodies'])}: {m['mode']}" for m in loose[: LIMITS.listed])
     listed = f" ({some}{'; …' if len(loose) > LIMITS.listed else ''})" if some else ""
     if len(loose) > outcome.free_modes:
         return [
@@ -383,10 +376,3 @@ def _free(outcome: Outcome) -> list[str]:
         f"{outcome.free_modes} rigid motions are free{listed}: nothing resists or drives them, the "
         "smallest displacement was taken"
     ]
-
-
-def _bodies(motion: dict[str, object]) -> str:
-    """Return the names of the bodies of a motion."""
-    bodies = motion["bodies"]
-    assert isinstance(bodies, list)
-    return ", ".join(bodies)

@@ -265,10 +265,7 @@ def difference(found: Any, expected: Any, what: str = "") -> tuple[str, Any, Any
 
 
 def _is_rounding(found: list[Any], expected: list[Any], rounding: float = 1e-10) -> bool:
-    """Return whether two lists are equal up to rounding beside their largest number.
-
-    What differs by less was computed on processors of other kinds.
-    """
+    """Return whether two lists are equal up to rounding, as of processors of other kinds."""
     if repr(found) == repr(expected):
         return True
     numbers = [*found, *expected]

@@ -175,12 +175,6 @@ class Parameter:
     description: Description  # what it is
     path: tuple[str, ...]  # names of the attributes that lead to it
 
-    def value_in(self, parameters: Any) -> Any:
-        """Its value in an object of the dataclass."""
-        for attribute in self.path:
-            parameters = getattr(parameters, attribute)
-        return parameters
-
 
 def parameters_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Parameter]:
     """All described parameters of a dataclass, those of dataclasses in it included, in order."""

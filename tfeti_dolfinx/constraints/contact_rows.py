@@ -36,30 +36,22 @@ class RowBuilder:
         self.records, self._dofs, self._weights = records, dofs, weights
         self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
 
-    def left(self, axis: int) -> tuple[Array, Array]:
-        """Squared norms in D⁻¹ without prescribed components; whether they exceed rounding."""
-        records = self.records
-        before, after = (
-            sum_rows(records.condition, np.sum(a**2 / self._total, axis=1), len(records))
-            for a in (records.coefficients(axis), self._free(axis))
-        )
-        return after, after > TOLERANCES.nothing_left**2 * before
+    def left(self, axis: int) -> tuple[Array, Array, Array]:
+        """Squared norms in D⁻¹ without prescribed components; whether they exceed rounding.
 
-    def free_share(self, axis: int) -> Array:
-        """Return the share of Σ_j |a_ij| along an axis that is not prescribed, shape ``(n,)``.
-
-        Rigid bodies with free motions count. It does not depend on stiffnesses.
+        And the share of Σ_j |a_ij| along the axis that is not prescribed, free motions of rigid
+        bodies included, which does not depend on stiffnesses. Shapes ``(n,)``.
         """
         records, rigid = self.records, self._rigid
-        before, after = (
-            sum_rows(records.condition, np.linalg.norm(a, axis=1), len(records))
-            for a in (records.coefficients(axis), self._free(axis))
-        )
+        both = records.coefficients(axis), self._free(axis)
+        of_D = [np.sum(a**2 / self._total, axis=1) for a in both]
+        terms = np.column_stack((*of_D, *(np.linalg.norm(a, axis=1) for a in both)))
+        before, after, *moduli = sum_rows(records.condition, terms, len(records)).T
         if rigid is not None:
-            along = np.abs(self._along(axis))
-            np.add.at(before, rigid.condition, along)
-            np.add.at(after, rigid.condition, along)
-        return np.asarray(after / np.maximum(before, TINY))
+            for of in moduli:
+                np.add.at(of, rigid.condition, np.abs(self._along(axis)))
+        share = moduli[1] / np.maximum(moduli[0], TINY)
+        return after, after > TOLERANCES.nothing_left**2 * before, share
 
     def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
         """Return a row for each of these conditions along an axis, times its scale."""
@@ -118,7 +110,7 @@ class ContactRows:
 def contact_rows(builder: RowBuilder) -> tuple[Rows, ContactRows]:
     """B_N from the conditions within reach, rows of unit norm in D⁻¹. Collective."""
     within_reach = builder.records.within_reach
-    squares, left = builder.left(0)
+    squares, left, _ = builder.left(0)
     condition = np.flatnonzero(within_reach & left)
     scale = 1.0 / np.sqrt(squares[condition])
     decided = np.flatnonzero(within_reach & ~left)
@@ -175,8 +167,8 @@ def tangent_rows(
         none, number = np.empty(0, dtype=np.int64), np.empty(0)
         moves = np.empty((0, count), dtype=bool)
         return Rows(none, none, none, number), TangentRows(none, number, moves, none)
-    squares, left = np.array([builder.left(1 + k) for k in range(count)]).transpose(1, 2, 0)
-    share = np.array([builder.free_share(1 + k) for k in range(count)]).T
+    of_axes = [builder.left(1 + k) for k in range(count)]
+    squares, left, share = np.array(of_axes).transpose(1, 2, 0)
     left = left * (share > TOLERANCES.little_left)
     of_normal, row = np.zeros(len(records)), np.full(len(records), -1)
     of_normal[normals.condition] = normals.scale

@@ -89,8 +89,7 @@ def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
 def _orthonormal(weights: Array) -> Array:
     """Return rows with zero sum, orthonormal in diag(weights)⁻¹: ``(n, k)`` to ``(n, k - 1, k)``.
 
-    Gram–Schmidt on e_i − e_{i+1} in closed form: row j is proportional to (w_1, …, w_j, −W_j) with
-    W_j = w_1 + … + w_j.
+    Gram–Schmidt on e_i − e_{i+1}: rows (w_1, …, w_j, −W_j) over norms, W_j = w_1 + … + w_j.
     """
     k = weights.shape[1]
     sums = np.cumsum(weights, axis=1)
@@ -162,12 +161,10 @@ def check_conditions(conditions: Sequence[fem.DirichletBC], V: fem.FunctionSpace
 def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
     """Raise if a condition prescribes facets of tears as if they were of the boundary. Collective.
 
-    To DOLFINx tears are exterior facets, so ``exterior_facet_indices`` and
-    ``locate_entities_boundary`` find them, too. A condition knows unknowns only. It is wrong if
-    each of its unknowns is on an exterior facet that it prescribes wholly, in a component, and some
-    of these facets are of the boundary, some of tears with nodes off the boundary. So a region may
-    be prescribed that has nodes inside of subdomains, and a surface inside a body in a condition of
-    its own.
+    To DOLFINx tears are exterior facets, too; a condition knows unknowns only. It is wrong if each
+    of its unknowns is on an exterior facet that it prescribes wholly, in a component, some of the
+    boundary, some of tears with nodes off it. So a region with nodes inside of subdomains may be
+    prescribed, and a surface inside a body in a condition of its own.
     """
     decomposition = dofs.decomposition
     if not bcs or not decomposition.is_torn:
@@ -279,7 +276,15 @@ class Gluing:
         normals, tangents = self.contact, self.tangents
         held = relative_motion(records, self.dofs, self.prescribed.value) - records.motion
         left = records.gap - np.sum(records.normal * held, axis=1)
-        self._check_decided(left[normals.decided])
+        decided, comm = left[normals.decided], self.dofs.comm
+        overlaps = comm.allreduce(int(np.sum(decided < -TOLERANCES.overlap * self.length)))
+        deepest = comm.allreduce(float(decided.min(initial=0.0)), op=MPI.MIN)
+        if overlaps:
+            raise NoSolutionError(
+                "an obstacle or a contact lies within a part of the surface whose displacement is "
+                f"prescribed: {overlaps} nodes penetrate by up to {-deepest:.6g} whatever the rest "
+                "does"
+            )
         along = np.einsum("ntg,ng->nt", records.tangents, held)
         slips = (self.slip - along)[tangents.condition]
         c = np.zeros(self.constraints.num_rows)
@@ -288,18 +293,6 @@ class Gluing:
         c[sets.normals] = left[normals.condition] * normals.scale
         c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
         return c
-
-    def _check_decided(self, left: Array) -> None:
-        """Raise where gaps less what prescribed components use up are negative. Collective."""
-        comm = self.dofs.comm
-        overlaps = comm.allreduce(int(np.sum(left < -TOLERANCES.overlap * self.length)))
-        deepest = comm.allreduce(float(left.min(initial=0.0)), op=MPI.MIN)
-        if overlaps:
-            raise NoSolutionError(
-                "an obstacle or a contact lies within a part of the surface whose displacement is "
-                f"prescribed: {overlaps} nodes penetrate by up to {-deepest:.6g} whatever the rest "
-                "does"
-            )
 
     def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
         """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.

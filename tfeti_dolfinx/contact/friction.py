@@ -188,27 +188,22 @@ def friction_values(
     x, what = group_points(dofs)[records.group], f"{name}: {friction.what}"
     columns = []
     for value in friction.values:
-        if isinstance(value, fem.Function):
-            value = _at_groups(what, value, dofs)[records.group]
+        if isinstance(value, fem.Function):  # the mean over torn copies
+            S, dof = dofs.scalar
+            if value.function_space.mesh._cpp_object is not S.mesh._cpp_object:
+                raise InputError(
+                    f"{what} is on another mesh; expected a function on decomposition.mesh, the "
+                    "torn mesh, where decomposition.from_original takes functions"
+                )
+            on_nodes = fem.Function(S)
+            on_nodes.interpolate(value)
+            total = dofs.reduce(on_nodes.x.array[dof], np.add)
+            value = (total / dofs.multiplicity)[records.group]
         with raised_on_all_ranks(dofs.comm):
             columns.append(numbers_at(what, value, x, lowest=0.0))
     if len(columns) < dofs.bs - 1:
         columns = columns * (dofs.bs - 1)
     return np.stack(columns, axis=1)
-
-
-def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
-    """Values of a function at the owned groups, the mean over the torn copies. Collective."""
-    S, dof = dofs.scalar
-    if function.function_space.mesh._cpp_object is not S.mesh._cpp_object:
-        raise InputError(
-            f"{what} is on another mesh; expected a function on decomposition.mesh, the torn "
-            "mesh, where decomposition.from_original takes functions"
-        )
-    on_nodes = fem.Function(S)
-    on_nodes.interpolate(function)
-    total = dofs.reduce(on_nodes.x.array[dof], np.add)
-    return np.asarray(total / dofs.multiplicity)
 
 
 def numbers_at(what: str, value: Any, x: Array, lowest: float = -np.inf) -> Array:

@@ -251,9 +251,8 @@ class Obstacle(ContactPartner):
         """One condition per vertex of the surface, from its present distance. Collective.
 
         With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex (or the gap that is
-        given), the condition is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i.
-        Of a displacement of degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to the
-        shape functions.
+        given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
+        n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
         facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface))
         kind = facet_kind(dofs)
@@ -471,11 +470,9 @@ def _ratios(
 ) -> tuple[float, float]:
     """Compare sizes and stiffness of the sides where they meet, first over second. Collective.
 
-    Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over its
-    vertices, K_ii the block of K before anything is glued, n_i the normal. Sizes h, roots of areas,
-    are harmonic means, which a few large facets beside many small ones do not decide. The vertices
-    that rows name are taken, so that a mesh that is fine only where the bodies touch is judged
-    there; where there is no such row, all of them.
+    Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over the
+    vertices that rows name, or all where there are none, K_ii the block of K before anything is
+    glued. Sizes h, roots of areas, are harmonic means, which few large facets do not decide.
     """
     whole = dofs.reduce(stiffness.reshape(-1, dofs.bs**2), np.add)
     blocks = whole.reshape(-1, dofs.bs, dofs.bs)

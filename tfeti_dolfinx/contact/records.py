@@ -183,11 +183,7 @@ def conditions(
 def _mean_gaps(
     dofs: TornDofs, vertices: Array, gap: GapIntegrals, area: Array, chosen: Array
 ) -> tuple[Array, Array]:
-    """∫ψ_i g / ∫ψ_i of some owned groups, and by how much g varies around them. Collective.
-
-    It is kept between the bounds on g: ψ_i is negative somewhere, and the mean would else fall
-    below the smallest gap.
-    """
+    """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width."""
     groups = vertices.ravel()
     total = dofs.reduce_on_owners(groups, gap.total.ravel())[chosen]
     low = dofs.reduce_on_owners(groups, gap.lowest.ravel(), np.minimum, np.inf)[chosen]

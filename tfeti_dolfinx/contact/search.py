@@ -187,10 +187,7 @@ class ContactSearch:
                 log.warning("contact %s has nothing within reach=, and no constraints", contact)
 
     def _approach(self, contact: ContactPartner, u: Array) -> float:
-        """Bound how much nearer two surfaces have come, 0 of an obstacle, the same on all ranks.
-
-        Largest displacements of both surfaces, against their common mean, added up.
-        """
+        """Sum of both surfaces' largest displacements against their common mean, on all ranks."""
         dofs, cut, comm = self._dofs, self._dofs.decomposition, self._dofs.comm
         if len(contact.surfaces) == 1:
             return 0.0

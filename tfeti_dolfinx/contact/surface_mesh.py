@@ -122,7 +122,15 @@ class SurfaceMesh:
         best = order[np.concatenate(([0], np.cumsum(counts)[:-1]))]
         q, weight, facet, apart = q[best], weight[best], facet[best], apart[best]
         # 3. the normal there, whose side says the sign
-        normal = self._normal_at(facet, weight)
+        normal, on = self._normal[facet].copy(), weight > 1e-9  # of a facet, an edge or a vertex
+        count = on.sum(axis=1)
+        at = np.flatnonzero(count == 1)
+        normal[at] = self._of_vertex[self._facets[facet[at], np.argmax(on[at], axis=1)]]
+        if self._gdim == 3:
+            at = np.flatnonzero(count == 2)
+            normal[at] = self._of_edge[facet[at], np.argmin(on[at], axis=1)]
+        size = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal /= np.where(size > 0.0, size, 1.0)
         sign = np.where(np.sum((p - q) * normal, axis=1) < 0.0, -1.0, 1.0)
         far = apart > 1e-9 * self._radius
         along = (p - q) / np.where(far, apart, 1.0)[:, None] * sign[:, None]
@@ -151,19 +159,6 @@ class SurfaceMesh:
         apart[0, np.any(inside < 0.0, axis=1)] = np.inf
         best = np.argmin(apart, axis=0), np.arange(len(p))
         return places[best], tried[best]
-
-    def _normal_at(self, facet: Array, weight: Array) -> Array:
-        """Return unit normals at points of facets: of these, of their edges or vertices."""
-        normal = self._normal[facet].copy()
-        on = weight > 1e-9
-        count = on.sum(axis=1)
-        at = np.flatnonzero(count == 1)
-        normal[at] = self._of_vertex[self._facets[facet[at], np.argmax(on[at], axis=1)]]
-        if self._gdim == 3:
-            at = np.flatnonzero(count == 2)
-            normal[at] = self._of_edge[facet[at], np.argmin(on[at], axis=1)]
-        size = np.linalg.norm(normal, axis=1, keepdims=True)
-        return np.asarray(np.where(size > 0.0, normal / np.where(size > 0.0, size, 1.0), normal))
 
 
 def _on_line(p: Array, a: Array, b: Array) -> Array:

@@ -109,11 +109,7 @@ class CoarseSpace(Coarse):
         return self._basis.transposed(e)
 
     def _on_bodies(self, Gt: csr_array) -> BodyRows:
-        """Return the rows of B R over their size on motions of bodies, without what is rounding.
-
-        Points far from the origin have more of it than motions, but all rows that do not only glue
-        act on translations with about their size.
-        """
+        """Return the rows of B R over their size on motions of bodies, without what is rounding."""
         J = Gt @ self.bodies.motions.csr()
         counts = np.diff(J.indptr)
         row = np.repeat(np.arange(len(counts)), counts)

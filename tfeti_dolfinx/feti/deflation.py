@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, hstack, vstack
 
@@ -122,7 +121,15 @@ class SoftModes:
         soft = bcast_from_root(self._comm, np.flatnonzero(energy < sigma * squares))
         if len(soft):
             scale = np.sqrt(np.maximum(energy[soft], PARAMETERS.rounding * sigma * squares[soft]))
-            if not _stands_out(preconditioner, csr_array(Gt[:, soft] / scale), self._comm):
+            # the power method for ĜMĜᵀ, of motions of energy 1
+            G, size = csr_array(Gt[:, soft] / scale), 0.0
+            v = np.random.default_rng(0).standard_normal(len(soft))
+            for _ in range(PARAMETERS.steps):
+                v /= np.linalg.norm(v)
+                with preconditioner.charged_to("soft motions"):
+                    image = summed(self._comm, G.T @ preconditioner(G @ v))
+                size, v = float(v @ image), image
+            if not bcast_from_root(self._comm, size > PARAMETERS.large):
                 soft = soft[:0]
         self.count = len(soft)
         null = coarse.null
@@ -162,17 +169,6 @@ class SoftModes:
 
 # from B, the natural coarse space, weights, preconditioner and a prefix of options
 MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, DualOperator, str], Deflation]
-
-
-def _stands_out(M: DualOperator, Gt: csr_array, comm: MPI.Intracomm) -> bool:
-    """Return whether ĜMĜᵀ, of motions of energy 1, has a large eigenvalue. Collective."""
-    v, size = np.random.default_rng(0).standard_normal(Gt.shape[1]), 0.0
-    for _ in range(PARAMETERS.steps):
-        v /= np.linalg.norm(v)
-        with M.charged_to("soft motions"):
-            image = summed(comm, Gt.T @ M(Gt @ v))
-        size, v = float(v @ image), image
-    return bcast_from_root(comm, size > PARAMETERS.large)
 
 
 def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:

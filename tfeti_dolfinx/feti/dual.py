@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -141,7 +142,7 @@ class Dual:
         self._on_all: FaceOperator | None = None
         self._on_last: tuple[Face, FaceOperator] | None = None
         self._held_load: Array | None = None
-        self._nearly_free: tuple[Array, list[dict[str, object]]] | None = None
+        self._nearly_free: tuple[Array, list[dict[str, Any]]] | None = None
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
         self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
@@ -169,10 +170,7 @@ class Dual:
         self._check_solvable()
 
     def _check_solvable(self) -> None:
-        """Raise where the load drives a motion that nothing holds. Collective.
-
-        What holds a load holds its multiples, but for friction with given limits.
-        """
+        """Raise where the load drives a motion that nothing holds. Collective."""
         coarse, comm = self.coarse, self.coarse.comm
         if not coarse.dimension:
             return
@@ -182,7 +180,7 @@ class Dual:
             apart = float(np.linalg.norm(load - size * known))
             if not any_rank(comm, apart > LIMITS.parallel * size):
                 return
-        self._held_load = None
+        self._held_load = None  # what holds a load holds its multiples, but for given limits
         check_solvable(coarse, self._given, self.pulling, load, *self._names)
         limited = len(self._given.pressed) < len(self._given.sets.tangents)
         if not any_rank(comm, limited or size == 0.0):
@@ -353,7 +351,7 @@ class Dual:
         lengths = norm_over(comm, known) + norm_over(comm, Fx)
         return lengths > LIMITS.far * norm_over(comm, self.driving)
 
-    def nearly_free(self, active: Array) -> list[dict[str, object]]:
+    def nearly_free(self, active: Array) -> list[dict[str, Any]]:
         """List motions that ``active`` contact rows hold hardly or not, see ``listed``."""
         known, comm = self._nearly_free, self.coarse.comm
         if known is None or any_rank(comm, not np.array_equal(active, known[0])):

@@ -197,9 +197,11 @@ class Motions:
     @cached_property
     def alone(self) -> csr_array:
         """The motions of single bodies as columns, shape ``(bodies * k, a)``."""
-        return entries_within(
-            block_diagonal(self.single), slice(None), np.flatnonzero(self.free)
-        ).csr()
+        n, k = self.free.shape
+        columns = np.repeat(np.arange(n * k).reshape(n, k), k, axis=0).ravel()
+        table, shape = k * np.arange(n * k + 1), (n * k, n * k)
+        every = Entries(self.single.ravel(), columns, table, shape)
+        return entries_within(every, slice(None), np.flatnonzero(self.free)).csr()
 
     @property
     def count(self) -> int:
@@ -212,13 +214,6 @@ class Motions:
         if not self.free.any():
             return self.joint
         return csr_array(hstack([self.alone, self.joint], format="csr"))
-
-
-def block_diagonal(blocks: Array) -> Entries:
-    """Square blocks of shape ``(n, k, k)`` as one sparse matrix."""
-    n, k = blocks.shape[:2]
-    columns = np.repeat(np.arange(n * k).reshape(n, k), k, axis=0).ravel()
-    return Entries(blocks.ravel(), columns, k * np.arange(n * k + 1), (n * k, n * k))
 
 
 def unsprung(shares: Array) -> Motions:
@@ -478,13 +473,13 @@ def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
 
 def listed(
     motions: Motions, bodies: Bodies, body_names: Sequence[str], mode_names: Sequence[str]
-) -> list[dict[str, object]]:
+) -> list[dict[str, Any]]:
     """List motions: ``bodies``, ``mode`` and the ``stiffness`` that holds them, 0 for none.
 
     Of several free motions of the same bodies any combination is one, too: such are named of which
     each has a coordinate that the others leave alone.
     """
-    found: list[dict[str, object]] = []
+    found: list[dict[str, Any]] = []
 
     def add(which: Sequence[int], columns: Array, stiffness: float) -> None:
         if stiffness == 0.0:

@@ -104,7 +104,15 @@ class Elasticity:
         self._stress: Any = None
         self.thickness: Any = 1.0
         if self.model == "axisymmetric":
-            self._on_axis = self._near_axis * self._checked_radius()
+            r, comm = self.mesh.geometry.x[:, 0], self.mesh.comm
+            largest = comm.allreduce(float(np.abs(r).max(initial=0.0)), op=MPI.MAX)
+            least = comm.allreduce(float(r.min(initial=np.inf)), op=MPI.MIN)
+            self._on_axis = self._near_axis * largest
+            if least < -self._on_axis:
+                raise InputError(
+                    f"model='axisymmetric': the mesh has points with the radius x[0] = {least:.6g}"
+                    "; expected 0 or more"
+                )
             self.thickness = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]
         elif thickness is not None:
             self.thickness = in_ufl(thickness, on, "thickness", POSITIVE)
@@ -192,18 +200,6 @@ class Elasticity:
         checked_type(dx, ufl.Measure, "dx", "a measure of UFL, or None")
         is_one = isinstance(self.thickness, float)
         return work * dx if is_one else self.thickness * work * dx
-
-    def _checked_radius(self) -> float:
-        """Return the largest radius of the mesh. Collective."""
-        r, comm = self.mesh.geometry.x[:, 0], self.mesh.comm
-        largest = comm.allreduce(float(np.abs(r).max(initial=0.0)), op=MPI.MAX)
-        least = comm.allreduce(float(r.min(initial=np.inf)), op=MPI.MIN)
-        if least < -self._near_axis * largest:
-            raise InputError(
-                f"model='axisymmetric': the mesh has points with the radius x[0] = {least:.6g}; "
-                "expected 0 or more"
-            )
-        return float(largest)
 
 
 def _checked_model(model: Any, gdim: int) -> str:

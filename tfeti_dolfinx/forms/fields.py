@@ -251,8 +251,7 @@ class StressRecovery:
 def _constants(gram: Array, right: Array, ridge: float = 1e-2) -> Array:
     """Return the constants of fits, shape ``(n, q)``, from their normal equations.
 
-    A patch with too few cells for a slope keeps the mean: the ridge, of the mean square distance of
-    its cells from the node, is added where a slope is fitted.
+    With the ridge, of slopes' mean square distances, patches of too few cells keep the mean.
     """
     slopes = np.arange(1, gram.shape[1])
     spread = gram[:, slopes, slopes].mean(axis=1, keepdims=True) if slopes.size else 0.0

@@ -71,19 +71,8 @@ def write_xdmf(
 ) -> list[Path]:
     """Write all fields of a solution to one XDMF file and its HDF5 companion. Collective.
 
-    Nodal fields are interpolated to the degree of the mesh geometry, which XDMF requires.
-
-    Args:
-        path: A name that ends with ``.xdmf``.
-        solution: The solution.
-        interior: As for ``write_vtx``.
-
-    Returns:
-        The files written.
-
-    Raises:
-        InputError: The name does not end with ``.xdmf``, or the files cannot be written there, as
-            where the disk is full; then what was there before stays.
+    Nodal fields are interpolated to the degree of the mesh geometry, which XDMF requires. Arguments
+    and errors are those of ``write_vtx``; the name ends with ``.xdmf``.
     """
     target = checked_target(path, ".xdmf", solution, interior)
     comm, mesh = solution.decomposition.comm, solution.decomposition.mesh
@@ -115,19 +104,8 @@ def write_pvd(
     """Write all fields of a solution for PyVista and ParaView. Collective.
 
     All fields are in one grid, those of nodes with the displacement's degree. The file names its
-    parts, ``<stem>000000.pvtu`` and ``<stem>_p0_000000.vtu`` of each rank.
-
-    Args:
-        path: A name that ends with ``.pvd``.
-        solution: The solution.
-        interior: As for ``write_vtx``.
-
-    Returns:
-        The files written.
-
-    Raises:
-        InputError: The name does not end with ``.pvd``, or the files cannot be written there, as
-            where the disk is full; then what was there before stays.
+    parts, ``<stem>000000.pvtu`` and ``<stem>_p0_000000.vtu`` of each rank. Arguments and errors are
+    those of ``write_vtx``; the name ends with ``.pvd``.
     """
     target = checked_target(path, ".pvd", solution, interior)
     return _one_step(target, solution, interior)
@@ -414,9 +392,7 @@ def end_file(partial: Path, name: Path, comm: MPI.Intracomm) -> None:
 def _reserve(name: Path, comm: MPI.Intracomm, size: int, before: int = 0) -> None:
     """Raise unless so many bytes fit beside a name, after those that a file has. Collective.
 
-    Rank 0 takes them for a file without a name, and gives them back: unlike a look at what is
-    free, that knows quotas and limits of a file's size, too. Where a file system cannot take
-    place, the C library writes a byte to each block.
+    Rank 0 takes and gives them back: that knows quotas and limits of a file's size, too.
     """
     what = f"cannot write {name}, up to {size / 1e6:.3g} MB more"
     with raised_on_all_ranks(comm), named(what, OSError):

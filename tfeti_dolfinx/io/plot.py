@@ -309,10 +309,7 @@ def _grid(solution: Solution, fields: dict[str, Array]) -> dict[str, Array]:
 
 
 def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
-    """Return one grid of the ranks' grids, whose tears are closed.
-
-    VTK's cells are (count, nodes …) in one array.
-    """
+    """Return one grid of the ranks' grids, whose tears are closed; cells as VTK has them."""
     starts = np.cumsum([0, *(len(part["points"]) for part in parts)])
     whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tables = [

@@ -132,7 +132,16 @@ class TornDofs:
         check_space(V, decomposition)
         self.V, self.decomposition, self.comm = V, decomposition, decomposition.comm
         self.bs, self.num_nodes = V.dofmap.index_map_bs, V.dofmap.index_map.size_local
-        self._number_nodes(decomposition)
+        # sorted by subdomain, in DOLFINx's order within each
+        subdomain = np.empty(self.num_nodes, dtype=np.int64)
+        subdomain[np.asarray(V.dofmap.list)] = decomposition.cell_subdomain[:, None]
+        self.dolfinx_node = np.argsort(subdomain, kind="stable")
+        self.primal_node = np.empty_like(self.dolfinx_node)
+        self.primal_node[self.dolfinx_node] = np.arange(self.num_nodes)
+        self.subdomains = decomposition.subdomains
+        self.node_subdomain = subdomain[self.dolfinx_node]
+        starts = np.searchsorted(self.node_subdomain, self.subdomains)
+        self.node_offsets = np.append(starts, self.num_nodes)
         self.nodes: Array | None = None
         self.offsets = chunk_offsets(self.comm, self.num_nodes)
         origin, key = node_keys(V, decomposition)
@@ -226,24 +235,10 @@ class TornDofs:
             found.append((asked, *self.lookup(groups[asked], *(c[jth] for c in columns))))
         return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
 
-    def _number_nodes(self, decomposition: Decomposition) -> None:
-        """Sort nodes by subdomain, keeping DOLFINx's order within each."""
-        cells = np.asarray(self.V.dofmap.list)
-        subdomain = np.empty(self.num_nodes, dtype=np.int64)
-        subdomain[cells] = decomposition.cell_subdomain[:, None]
-        self.dolfinx_node = np.argsort(subdomain, kind="stable")
-        self.primal_node = np.empty_like(self.dolfinx_node)
-        self.primal_node[self.dolfinx_node] = np.arange(self.num_nodes)
-        self.subdomains = decomposition.subdomains
-        in_order = subdomain[self.dolfinx_node]
-        self.node_offsets = np.append(np.searchsorted(in_order, self.subdomains), self.num_nodes)
-        self.node_subdomain = in_order
-
     def _find_groups(self, decomposition: Decomposition, origin: Array, key: Array) -> None:
-        """Find all copies of each node.
+        """Find all copies of each node, which meet on the rank that their key names.
 
-        Only nodes on the boundary of a subdomain can have copies. They meet on the rank that
-        their key names, which tells each the rank of its lowest subdomain, the owner.
+        It tells each, of those on boundaries of subdomains, the owner: that of the lowest.
         """
         body = decomposition.body_of_subdomain[self.node_subdomain]
         key = mix(key + mix(body))

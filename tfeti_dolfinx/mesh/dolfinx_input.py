@@ -87,9 +87,16 @@ def decompose(
         2
     """
     if not isinstance(mesh, dmesh.Mesh) and hasattr(mesh, "physical_groups"):
-        mesh, cell_tags, facet_tags, surfaces, volumes = _of_gmsh(
-            mesh, cell_tags, facet_tags, surfaces, volumes
-        )
+        data, dim = mesh, mesh.mesh.topology.dim
+        mesh = data.mesh
+        cell_tags = data.cell_tags if cell_tags is None else cell_tags
+        facet_tags = data.facet_tags if facet_tags is None else facet_tags
+        names: dict[int, dict[str, int | Marker]] = {dim - 1: {}, dim: {}}
+        for name, (of, tag) in data.physical_groups.items():
+            if of in names and name:
+                names[of][name] = tag
+        surfaces = (names[dim - 1] or None) if surfaces is None else surfaces
+        volumes = (names[dim] or None) if volumes is None else volumes
     mesh = _checked_mesh(mesh)
     tagged = ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags"))
     with agreeing(mesh.comm, "decompose") as given:
@@ -114,34 +121,10 @@ def decompose(
     return replace(decomposition, seconds=seconds, untorn=mesh)
 
 
-def _of_gmsh(
-    data: GmshData,
-    cell_tags: dmesh.MeshTags | None,
-    facet_tags: dmesh.MeshTags | None,
-    surfaces: Mapping[str, int | Marker] | None,
-    volumes: Mapping[str, int | Marker] | None,
-) -> tuple[Any, ...]:
-    """Return mesh, tags and names: those given, else those of gmsh."""
-    dim = data.mesh.topology.dim
-
-    def names(of: int) -> dict[str, int] | None:
-        found = {name: tag for name, (d, tag) in data.physical_groups.items() if d == of and name}
-        return found or None
-
-    cell_tags = data.cell_tags if cell_tags is None else cell_tags
-    facet_tags = data.facet_tags if facet_tags is None else facet_tags
-    surfaces = names(dim - 1) if surfaces is None else surfaces
-    volumes = names(dim) if volumes is None else volumes
-    return data.mesh, cell_tags, facet_tags, surfaces, volumes
-
-
 def _located(
     mesh: dmesh.Mesh, names: Any, tags: dmesh.MeshTags | None, what: str
 ) -> tuple[Any, dmesh.MeshTags | None]:
-    """Give what markers locate tags of their own, above those that are there. Collective.
-
-    Raise an InputError where a marker fails, finds nothing, or finds what has another tag.
-    """
+    """Give what markers locate tags of their own, above those that are there. Collective."""
     markers = {k: v for k, v in names.items() if callable(v)} if isinstance(names, Mapping) else {}
     if not markers:
         return names, tags

@@ -155,10 +155,7 @@ def _original_physical_group(model: Any, dim: int, tag: int) -> int:
 
 
 def _elements(model: Any, dim: int) -> Elements | None:
-    """All elements of a dimension that lie in physical groups; None if there are none.
-
-    The ghost cells of gmsh's partitions lie in entities of their own, without a group.
-    """
+    """All elements of a dimension that lie in physical groups, no ghost cells; None if none do."""
     found: list[Elements] = []
     for _, entity in model.getEntities(dim):
         of_entity = model.getPhysicalGroupsForEntity(dim, entity)

@@ -66,14 +66,9 @@ def beside(kind: FacetKind, facets: Facets, rows: Array, xi: Array) -> Array:
 
 def _monomials(t: Array) -> Array:
     """½ tᵀKt = Σ_k m_k(t) K_k, K_k the entries of K on and above the diagonal."""
-    n = t.shape[-1]
-    return np.stack(
-        [
-            (0.5 if i == j else 1.0) * t[..., i] * t[..., j]
-            for i, j in combinations_with_replacement(range(n), 2)
-        ],
-        axis=-1,
-    )
+    pairs = combinations_with_replacement(range(t.shape[-1]), 2)
+    terms = [(0.5 if i == j else 1.0) * t[..., i] * t[..., j] for i, j in pairs]
+    return np.stack(terms, axis=-1)
 
 
 def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Array]:
@@ -263,11 +258,7 @@ def _gaps(
 def _apart(
     kind: FacetKind, secondary: Facets, primary: Facets, at: FacingPoints, curved: bool
 ) -> Array:
-    """Vectors along the surface's normal that close the gap, shape ``(m, gdim)``.
-
-    From one facet to the other one looks along the normal of a whole facet; what closes the gap
-    of curved bodies is the part along the normal at the point, interpolated from the vertices.
-    """
+    """Vectors along the normal at the point, of the vertices, that close the gap: ``(m, gdim)``."""
     there = points(kind.geometry, primary.x[at.primary], at.eta)
     here = points(kind.geometry, secondary.x[at.secondary], at.xi)
     if curved:
@@ -281,10 +272,9 @@ def _apart(
 def _range(
     dual: DualMultipliers, normals: Array, facet: Array, apart: Array, whole: Array
 ) -> tuple[Array, Array]:
-    """Smallest and largest n_i·(x_p − x_s) that multipliers weigh on each facet.
+    """Smallest and largest n_i·(x_p − x_s) that multipliers weigh on each facet; ∞ covered in part.
 
-    On a facet that is covered in part, a vertex may lie beside the part, and its multiplier
-    extrapolates there: upwards that is right, downwards it could be an overlap that is none.
+    There a multiplier extrapolates: upwards that is right, downwards it could overlap.
     """
     place = np.searchsorted(dual.facet, facet)
     gap = np.einsum("md,mvd->mv", apart, normals[place])

@@ -102,10 +102,9 @@ def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple
     """Find pairs of facets that may meet along the secondary facets' normals.
 
     A primary facet is found if it comes within a secondary facet's radius of the line through that
-    facet's centre along its averaged normal, no farther than ``distance``, to both sides, and the
-    facets' sizes from the centre. Primary facets are sorted into classes of equal size up to a
-    factor of 2, each with a tree of its own, so that a graded mesh does not make large facets meet
-    small ones in vain.
+    facet's centre along its averaged normal, no farther than ``distance`` and the facets' sizes to
+    both sides. Those of each size, up to a factor of 2, have a tree of their own, so that a graded
+    mesh does not make large facets meet small ones in vain.
     """
     s_centre, s_size = secondary.centre, secondary.radius
     p_centre, p_size = primary.centre, primary.radius
@@ -271,9 +270,8 @@ class _Planes:
     def behind(self, found: _Meetings, facing: Array) -> Array:
         """Return which overlaps are none: a way out of the primary body lies before them.
 
-        An overlap means that the primary body reaches from its facet, behind the secondary one, up
-        to that. If it ends before, at a facet that looks the same way as the secondary one, the
-        pair is one of two faces that look away from each other through thin bodies.
+        If that ends at a facet that looks the same way as the secondary one, the pair is one of two
+        faces that look away from each other through thin bodies.
         """
         same = SEARCH.same_layer * self._secondary.radius[found.s]
         deep = found.distance < -same
@@ -294,10 +292,7 @@ class _Planes:
         return first
 
     def _over(self, found: _Meetings, first: Array, second: Array) -> tuple[Array, Array]:
-        """Return those of the first pairs whose middle a second one lies over, and its distance.
-
-        They count where the secondary facet is the same.
-        """
+        """First pairs whose middle a second one of the same facet lies over, and its distance."""
         ordered = second[np.argsort(found.s[second], kind="stable")]
         start = np.searchsorted(found.s[ordered], found.s[first], side="left")
         count = np.searchsorted(found.s[ordered], found.s[first], side="right") - start
@@ -324,10 +319,7 @@ class _Planes:
         return np.einsum("nvg,ntg->nvt", x - self._centre[s][:, None], self._tangents[s])
 
     def _distance(self, s: Array, p: Array, corners: Array, y: Array) -> Array:
-        """Return distance along the normal at points y of the planes, p's vertices there given.
-
-        From the vertices of the facets: it decides what meets what, and is no gap.
-        """
+        """Distance of the vertices' interpolants along the normal at points y of the planes."""
         hats = self._kind.hats
         xi = reference_points(hats, self.corners[s], y)
         eta = reference_points(hats, corners, y)

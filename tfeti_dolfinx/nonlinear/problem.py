@@ -84,6 +84,7 @@ class NonlinearContactProblem(ContactProblem):
     """
 
     form_name: ClassVar[str] = "J"
+    _unknown_before: ClassVar[tuple[str, ...]] = NewtonForms.names
 
     def __init__(
         self,
@@ -448,9 +449,6 @@ class NonlinearContactProblem(ContactProblem):
         solution = super()._make_solution(u, multipliers, gluing)
         solution.finite = self._finite
         return solution
-
-    def _known_before(self, given: dict[str, Any]) -> dict[str, Any]:
-        return {name: value for name, value in given.items() if name not in NewtonForms.names}
 
     def _return(self) -> None:
         super()._return()

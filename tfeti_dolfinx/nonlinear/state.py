@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,8 +61,10 @@ class InternalVariables:
                     f"{name} is {shown(value)}; expected a UFL expression of shape "
                     f"{function.ufl_shape}, or a callable"
                 )
+            V = function.function_space
             with raised_on_all_ranks(self._comm), named(f"{name} cannot be compiled"):
-                self._new.append((function, _evaluated(value, function)))
+                expression = fem.Expression(value, interpolation_points(V))
+            self._new.append((function, partial(_interpolated, expression, fem.Function(V))))
 
     @property
     def functions(self) -> list[fem.Function]:
@@ -137,14 +140,6 @@ def _of_cells(function: fem.Function) -> Array:
     return np.asarray(rows.reshape(cells, width * dofmap.bs))
 
 
-def _evaluated(value: Any, function: fem.Function) -> Callable[[], Array]:
-    """Return a callable that interpolates an expression into the space of a function."""
-    V = function.function_space
-    expression = fem.Expression(value, interpolation_points(V))
-    target = fem.Function(V)
-
-    def evaluate() -> Array:
-        target.interpolate(expression)
-        return np.array(target.x.array)
-
-    return evaluate
+def _interpolated(expression: fem.Expression, target: fem.Function) -> Array:
+    target.interpolate(expression)
+    return np.array(target.x.array)

@@ -197,10 +197,7 @@ def _solved_on_face(
     target: float,
     parameters: FrictionParameters,
 ) -> LawPoint:
-    """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e on a face, λ = λ₁ + (I + C)u. Collective.
-
-    ``share`` of the residual is left.
-    """
+    """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0, Gλ = e on a face, λ = λ₁ + (I + C)u, but for a share."""
     qp, comm = program.qp, program.qp.coarse.comm
     oblique = program.oblique(on.face, on.C)
     M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None

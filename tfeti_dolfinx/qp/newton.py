@@ -103,11 +103,10 @@ def first_point(qp: QP) -> Array:
 def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1, roughly: float = 1e-3) -> Array:
     """Return forces of rigid bodies on springs that balance the load: which rows touch first.
 
-    It is the feasible point nearest to the forces of springs that gaps press. How many rows carry
-    depends on how soft springs are, and that on how many carry: found by at most ``max_it`` turns,
-    which balance the load up to the share ``roughly``, until these numbers differ by no more than
-    the share ``alike``, from the least λ of Ω on. Where that does not balance the load, it is
-    that. A projection begins where the last has ended, the first at the least λ of all. Collective.
+    It is the feasible point nearest to the forces of springs that gaps press, or the least λ of Ω
+    where that does not balance the load. How many rows carry depends on how soft springs are, and
+    that on how many carry: found in turns that balance the load up to the share ``roughly``, until
+    both numbers differ by no more than the share ``alike``. Collective.
     """
     whole = qp.coarse.solve(qp.coarse.e)
     lam, alpha = project_onto_feasible(qp.coarse, qp.feasible, np.zeros(len(qp.d)), whole)
@@ -243,10 +242,9 @@ class NewtonIteration:
         """Step 2: start and face of the next solve.
 
         The face is that of λ, with the rows that want to carry if the chopped gradient β dominates
-        the free one. Near its circle a point that sticks, and whose gradient points outwards, would
-        leave by far, in a direction of no use; so would, with friction, one that touches with less
-        force than it is open by. Where there are any the solve begins at λ̂, on its face, for one
-        multiplication by F.
+        the free one. Where points would leave by far, that stick near their circle with a gradient
+        outwards, or with friction touch with less force than they are open by, the solve begins at
+        λ̂, on its face, for one multiplication by F.
         """
         z = self.z
         phi, beta = self.feasible.split(z.lam, self.s)
@@ -414,10 +412,10 @@ class FaceSolver:
         return z
 
     def _restored(self, end: Point) -> Point | None:
-        """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e.
+        """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e; None: none.
 
-        Where that face holds a body no longer, the nearest feasible point within the face before
-        names rows that do, so that faces shrink and steps end. None if there is none.
+        Where it holds a body no longer, the nearest feasible point within the face before names
+        rows that do, so that faces shrink and steps end.
         """
         qp, before = self._qp, self._face
         assert before is not None
@@ -474,10 +472,7 @@ class FaceSolver:
         return z
 
     def _unseen(self, way: Array, Fw: Array) -> tuple[Array, Array]:
-        """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see.
-
-        What PCPG has left of the others in w is small beside it, but its bounds would end the way.
-        """
+        """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see."""
         qp, given = self._qp, self._parameters
         exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
         program = replace(self._on_face, F=qp.F, d=Fw, recycled=None)

@@ -80,8 +80,16 @@ def project_onto_feasible(
         face = feasible.face(trial.lam, trial.lam - trial.z)
         step = coarse.damped_solve(face.damped(), trial.residual, damping)
         slope = float(trial.residual @ step)
-        trial, length, tried = _searched(coarse, feasible, y, trial, step, parameters)
-        trials += tried
+        # halve the step until it does not raise the cost; where that still falls at the end of a
+        # step, it fell along all of it, as it is convex, however rounding hides its difference
+        start, length = trial, 1.0
+        while True:
+            trial, trials = _trial(coarse, feasible, y, start.alpha + length * step), trials + 1
+            fell = trial.cost <= start.cost + parameters.rounding * abs(start.cost)
+            fell = fell or float(trial.residual @ step) >= 0.0
+            if bcast_from_root(comm, fell or length <= parameters.shortest):
+                break
+            length *= 0.5
         left = float(trial.residual @ step)
         whole = bcast_from_root(comm, length == 1.0 and left > parameters.left * slope)
         unmet = unmet + 1 if whole else 0
@@ -142,27 +150,3 @@ def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: 
     (cost,), residual = summed(coarse.comm, np.array([own])), coarse.residual(lam)
     length = float(np.sqrt(residual @ residual))
     return _Trial(alpha, z, lam, residual, float(cost - alpha @ coarse.e), length)
-
-
-def _searched(
-    coarse: Coarse,
-    feasible: FeasibleSet | WithinFace,
-    y: Array,
-    start: _Trial,
-    step: Array,
-    parameters: ProjectionParameters,
-) -> tuple[_Trial, float, int]:
-    """Halve the step until it does not raise the cost.
-
-    Where the cost still falls at the end of a step, it fell along all of it, as it is convex: that
-    tells where rounding hides its difference. Returns the point, the length and how many were
-    tried.
-    """
-    length, tried = 1.0, 0
-    while True:
-        trial, tried = _trial(coarse, feasible, y, start.alpha + length * step), tried + 1
-        fell = trial.cost <= start.cost + parameters.rounding * abs(start.cost)
-        fell = fell or float(trial.residual @ step) >= 0.0
-        if bcast_from_root(coarse.comm, fell or length <= parameters.shortest):
-            return trial, length, tried
-        length *= 0.5

@@ -254,11 +254,7 @@ class FrictionBounds:
         return change
 
     def _relaxation(self) -> float:
-        """Return the share of the next step: Aitken's of the last two problems, 1 at most.
-
-        Where forces found turn to and fro as bounds change, whole steps lead away or not on
-        (Irons, Tuck, IJNME 1, 1969).
-        """
+        """Return the share of the next step: Aitken's (Irons, Tuck, IJNME 1, 1969), 1 at most."""
         if len(self._solved) < 2:
             return 1.0
         (first, of_first), (now, found) = self._solved
@@ -282,11 +278,9 @@ class FrictionBounds:
         return fits
 
     def advance(self) -> None:
-        """Go towards the forces that were found, all of the way unless that has led away.
-
-        Forces that fall to less than half again and again, as where slips of earlier steps alone
-        drive, make a geometric series: of its bounds the limit 0 is tried.
-        """
+        """Go towards the forces that were found, all of the way unless that has led away."""
+        # forces that fall to less than half again and again, as where slips of earlier steps alone
+        # drive, make a geometric series: of its bounds the limit 0 is tried
         if self._falls == self._parameters.falls and not self.stick:
             self.now = np.zeros_like(self._found)
             return
@@ -298,10 +292,7 @@ class FrictionBounds:
         return np.where(lam[self._rows] > max(self._none, none), lam[self._rows], 0.0)
 
     def _unknown(self) -> Array:
-        """Return flags of rows on bodies whose forces tell nothing of the friction that holds them.
-
-        Bounds of 0 would leave motions free there that rounding drives.
-        """
+        """Flags of rows on bodies that friction may hold, and whose forces tell nothing of it."""
         coarse, rows = self._dual.coarse, np.zeros(self._constraints.num_rows, dtype=bool)
         loose = np.any(coarse.unheld.free, axis=1) & (self._on_bodies(self.now) == 0.0)
         rows[coarse.J.row[loose[coarse.J.body]]] = True

@@ -147,24 +147,20 @@ class Checkpoint:
         kept: Kept | None = None
         with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
             if self._comm.rank == 0 and self._index.number:
-                kept = self._read()
+                index, file = self._index, self.path / RECORDS
+                lines = file.read_bytes().splitlines(keepends=True)[: index.number]
+                found = [_unsealed(line, file, INDEX) for line in lines]
+                if len(found) < index.number:
+                    raise damaged(file, INDEX)
+                os.truncate(file, sum(len(line) for line in lines))  # what lies beyond goes
+                fields, owned = ([r.pop(name) for r in found] for name in ("fields", "subdomains"))
+                kept = Kept(index, found, fields, owned)
                 for file in self.path.iterdir():
                     if self._index.owns(file) and not self._index.counts(file):
                         file.unlink()
                 if self._index.ranks < self._comm.size:  # before files of more ranks come
                     self._commit(replace(self._index, ranks=self._comm.size))
         return self._comm.bcast(kept, root=0)
-
-    def _read(self) -> Kept:
-        """Return what rank 0 reads; what lies beyond the lines that count goes."""
-        index, file = self._index, self.path / RECORDS
-        lines = file.read_bytes().splitlines(keepends=True)[: index.number]
-        found = [_unsealed(line, file, INDEX) for line in lines]
-        if len(found) < index.number:
-            raise damaged(file, INDEX)
-        os.truncate(file, sum(len(line) for line in lines))
-        fields = [record.pop("fields") for record in found]
-        return Kept(index, found, fields, [record.pop("subdomains") for record in found])
 
     def write(
         self,
@@ -239,10 +235,7 @@ class Checkpoint:
         return self._load("fields", number, checksums, kept.subdomains[number - 1], RECORDS)
 
     def _save(self, name: str, table: Table) -> str:
-        """Write arrays, their rows by labels, and how many each subdomain has.
-
-        Return the checksum of the file's bytes.
-        """
+        """Write arrays, rows by labels, and how many each subdomain has; return a checksum."""
         arrays: dict[str, Array] = {}
         for column, (values, labels) in table.items():
             arrays[column] = values
@@ -258,10 +251,7 @@ class Checkpoint:
     def _load(
         self, kind: str, number: int, checksums: list[str], subdomains: list[list[int]], where: str
     ) -> Table:
-        """Return what this rank's subdomains have; rows stand by labels.
-
-        Nothing looks into a file that is not as it was written.
-        """
+        """Return what this rank's subdomains have; rows stand by labels."""
         rank_of = {s: rank for rank, own in enumerate(subdomains) for s in own}
         found: dict[int, dict[str, Array]] = {}
         with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
@@ -336,10 +326,7 @@ def _joined(
     places: list[tuple[int, int]],
     files: dict[int, dict[str, Array]],
 ) -> tuple[Array, Array | None]:
-    """Return an array's rows of subdomains, each from a file and a place in it, and their labels.
-
-    Without counts of rows it is the same in all files; a rank without rows has counts of nothing.
-    """
+    """Return rows of an array by subdomains, each at a place in a file, and their labels."""
     first = next(iter(files.values()))
     if any(name + COUNTS not in arrays for arrays in files.values()):
         return first[name], None

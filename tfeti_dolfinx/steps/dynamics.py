@@ -307,11 +307,16 @@ class ContactDynamics(ContactProblem):
         return self.u
 
     def _set_out(self) -> None:
-        motion = self._forms_in_time.inertia.motion
+        inertia, system = self._forms_in_time.inertia, self._system
+        motion = inertia.motion
         motion.towards = free = motion.free
-        if self._predictor is not None:
-            motion.towards = self._predicted(self._predictor, free)
-        self._system.change("load")
+        if self._predictor is not None:  # what contact allows the bodies without elasticity
+            system.make_up_to("right side", self._seconds)
+            if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
+                system.change("constraints")
+                system.make_up_to("right side", self._seconds)
+            motion.towards = self._predictor.nearest(free, inertia.M, system.gluing)
+        system.change("load")
 
     def accept(self) -> None:
         """Take the last solution as the end of the step: the next one begins there.
@@ -369,15 +374,6 @@ class ContactDynamics(ContactProblem):
         way = self.dofs.to_dolfinx(u) - motion.towards
         solution.v = motion.start + 2.0 / motion.size * way
         return solution
-
-    def _predicted(self, predictor: Predictor, free: Array) -> Array:
-        """Return the displacement that contact allows the bodies without elasticity."""
-        system = self._system
-        system.make_up_to("right side", self._seconds)
-        if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
-            system.change("constraints")
-            system.make_up_to("right side", self._seconds)
-        return predictor.nearest(free, self._forms_in_time.inertia.M, system.gluing)
 
     def _look(self) -> None:
         """Put energies, work and forces into the report."""
@@ -469,11 +465,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         super()._find()
 
     def _project_velocity(self) -> None:
-        """Start the step with the velocity that goes to the prediction.
-
-        What a node keeps of the velocity with which it hits would work where normals turn. What
-        contact takes of the momentum is a blow, a part of its mean force over the step.
-        """
+        """Start with the velocity that goes to the prediction; what contact takes is a blow."""
         motion, predictor = self._newton_forms.inertia.motion, self._predictor
         motion.start, self._blows = motion.v, []
         if predictor is None or predictor.multipliers is None:

@@ -98,7 +98,7 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
         factor = regularised(shifted, R, fixing_dofs, prefix)
     except NotPositiveDefiniteError:
         return "the stiffness is not positive semidefinite; expected a linear elastic form"
-    if _gives_no_energy(K, R, x, factor):
+    if gives_no_energy(K, R, x, factor):
         return (
             f"the form gives no energy to motions besides the {R.shape[1]} of a rigid body that it "
             "leaves free; expected a linear elastic form of the whole strain, with quadrature that "
@@ -113,32 +113,24 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
     )
 
 
-def check_rank(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> None:
-    """Raise if K⁺ blows up a motion that is not rigid and that K gives no energy.
+def gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool:
+    """Return whether an inverse of K_ρ blows up a motion that is not rigid and has no energy.
 
     Pivots that should be 0 are positive where rounding makes them so. It takes one solve.
     """
-    if _gives_no_energy(K, R, x, inverse):
-        raise NotPositiveDefiniteError("a pivot is zero but for rounding")
-
-
-def _gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool:
-    """Return whether an inverse of K_ρ blows up a motion that is not rigid and has no energy."""
     R = _with_weakly_held(K, R, x)
     force = _beside(R, np.random.default_rng(0).standard_normal(K.shape[0]))
     u = _beside(R, inverse.solve(force))
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
-    return lost and not _may_hide_energy(K, x)
-
-
-def _may_hide_energy(K: Any, x: Array) -> bool:
-    """Return whether rounding may be as large as the energy of the softest deformations."""
+    if not lost:
+        return False
+    # rounding may be as large as the energy of the softest deformations
     entries, diagonal = K.tocoo(), K.diagonal()
     row, column = (index // (K.shape[0] // len(x)) for index in entries.coords)
     edges = np.linalg.norm(x[row] - x[column], axis=1)[row != column]
     length = np.linalg.norm(np.ptp(x, axis=0))
     fine = length > TOLERANCES.fine * edges.min(initial=np.inf)
-    return bool(fine or diagonal.max() > TOLERANCES.spread * diagonal.min())
+    return not (fine or diagonal.max() > TOLERANCES.spread * diagonal.min())
 
 
 def _with_weakly_held(K: Any, R: Array, x: Array) -> Array:

@@ -29,7 +29,7 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteE
 from tfeti_dolfinx.subdomains.kplus import (
     GeneralisedInverse,
     InverseFactory,
-    check_rank,
+    gives_no_energy,
     regularised,
     why_indefinite,
 )
@@ -67,7 +67,8 @@ class Stiffness:
             self.entries = self.size**2 / 2.0
             if isinstance(self._pinv, CholeskyFactor):
                 self.entries = self._pinv.entries
-                check_rank(K, R, x, self._pinv)
+                if gives_no_energy(K, R, x, self._pinv):
+                    raise NotPositiveDefiniteError("a pivot is zero but for rounding")
         except NotPositiveDefiniteError as error:
             raise InputError(f"{name}: {why_indefinite(K, R, fixing, x, how.prefix)}") from error
         except FactorError as error:
@@ -272,15 +273,13 @@ class SparseBlock(Block):
 
     def set_stiffness(self, K: Any) -> None:
         """Take a stiffness."""
-        stiffness, self.place = self._found(K)
+        if self.equals is not None:
+            stiffness, self.place = self.equals.find(self.name, self.x, K)
+        else:
+            stiffness = Stiffness(self.name, self.x, K, self._how)
+            self.place = np.arange(K.shape[0])
         self._stiffness: Stiffness | None = stiffness
         self.diagonal, self.kernel = stiffness.diagonal[self.place], stiffness.kernel[self.place]
-
-    def _found(self, K: Any) -> tuple[Stiffness, Array]:
-        """Return a Stiffness of K, and the place of each unknown in it."""
-        if self.equals is not None:
-            return self.equals.find(self.name, self.x, K)
-        return Stiffness(self.name, self.x, K, self._how), np.arange(K.shape[0])
 
     @property
     def stiffness(self) -> Stiffness:
