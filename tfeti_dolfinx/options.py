@@ -210,7 +210,12 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
     named = _without_prefix(given, prefix)
     database = PETSc.Options(prefix)
     named |= {name: database.getString(name, "") for name in database.getAll()}
-    _check_reached(named, prefix)
+    for word in sys.argv[1:]:
+        if word.startswith(f"-{prefix}") and word.removeprefix(f"-{prefix}") not in named:
+            raise InputError(
+                f"{word} on the command line did not reach PETSc; call petsc4py.init(sys.argv) "
+                "before dolfinx is imported"
+            )
     known = {option.name: option for option in parameters_of(Options)}
     for name in named:
         if name not in known and not FACTOR_OPTION.fullmatch(name):
@@ -303,16 +308,6 @@ def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
             raise InputError(f"petsc_options: -{prefix}{short} is there twice; expected it once")
         named[short] = value
     return named
-
-
-def _check_reached(named: Mapping[str, Any], prefix: str) -> None:
-    """Raise if the command line has options that PETSc was not given."""
-    for word in sys.argv[1:]:
-        if word.startswith(f"-{prefix}") and word.removeprefix(f"-{prefix}") not in named:
-            raise InputError(
-                f"{word} on the command line did not reach PETSc; call petsc4py.init(sys.argv) "
-                "before dolfinx is imported"
-            )
 
 
 def _converted(option: Parameter, value: Any, prefix: str) -> Any:

@@ -87,11 +87,9 @@ class Settings:
     ) -> Subdomains:
         """Make a Block of each subdomain, whose data is let go then, and one of all. Collective.
 
-        ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; ``tools``
-        are rigid bodies, of which those with free motions get Blocks. Stiffnesses that ``equals``
-        knows are shared, unless the type of local operators is another; ``tangents`` do not stay.
-        Raise an InputError where stiffness or load do not fit; a FactorError where a factor could
-        not be made.
+        ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; of
+        ``tools`` those with free motions get Blocks. Stiffnesses that ``equals`` knows are shared,
+        unless the type of local operators is another; ``tangents`` do not stay.
         """
         own, options, decomposition = self.extensions, self.options, dofs.decomposition
         expected = options.local_multiplications // (OF_TANGENT if tangents else 1)
@@ -133,8 +131,7 @@ class Settings:
         """Return the dual problem, and the options with what ``auto`` stands for. Collective.
 
         Raise an InputError where the solver cannot keep the rows, or takes no preconditioner of
-        one's own; a NoSolutionError where the load moves a body that nothing holds; a FactorError
-        where a matrix could not be factored.
+        one's own; else as ``Dual``.
         """
         rows, gdim = constraints.sets.contact_rows(dofs.comm), dofs.V.mesh.geometry.dim
         options = resolved(self.options, rows, self.prefix)

@@ -180,8 +180,7 @@ class Diagnostics:
     def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
         """Warn of slender bodies, whose small bending energy is inexact by the rounding of K.
 
-        Entries of K are right to ε, so the energy uᵀKu is to ε Σ|K_ij u_i u_j|, about ε uᵀDu, D
-        the diagonal; of u less the rigid motion of the body, which K knows to do no work.
+        That of uᵀKu is about ε uᵀDu, D the diagonal, of u less the rigid motion of the body.
         """
         subdomains, motions = dual.subdomains, dual.coarse.bodies
         u = subdomains.with_rigid(u)

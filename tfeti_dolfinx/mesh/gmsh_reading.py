@@ -234,10 +234,9 @@ def _facet_tags(
     facets: Sequence[Elements],
     comm: MPI.Intracomm | None,
 ) -> Array:
-    """Tag of each facet of each cell, shape ``(n, facets_per_cell)``. Collective.
+    """Tag of each facet of each cell, ``(n, facets_per_cell)``, by the first element there.
 
-    A facet of a cell and the element that tags it meet on the rank that their key names, without
-    a communicator here; of several elements the first counts.
+    Both meet on the rank that their key names, without a communicator here. Collective.
     """
     corners = facet_vertices(cell_type)
     tagged = np.concatenate(

@@ -57,7 +57,11 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     """
     comm, bodies = graph.comm, graph.pieces(np.zeros(graph.num_cells, dtype=np.int64))
     body, sizes = bodies.of_cell, bodies.size
-    shares = _shares(sizes, num_parts)
+    # by largest remainders
+    exact = sizes / max(sizes.sum(), 1) * num_parts
+    shares = np.maximum(np.floor(exact).astype(np.int64), 1)
+    shares[np.argsort(shares - exact, kind="stable")[: max(num_parts - shares.sum(), 0)]] += 1
+    shares = np.minimum(shares, sizes)
     if np.all(shares == 1):
         return body
     extents = mesh.extents()
@@ -81,14 +85,6 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
         some = boxes[body]
         part[some] = bisect_points(x[some], shares, comm, extents[some], body=body[some])
     return flatten_interfaces(graph, part, key, np.where(boxes, 0.0, sizes / shares)[home])
-
-
-def _shares(weights: Array, num_parts: int) -> Array:
-    """Split a number of parts by weights (largest remainders), at least one each."""
-    exact = weights / max(weights.sum(), 1) * num_parts
-    shares = np.maximum(np.floor(exact).astype(np.int64), 1)
-    shares[np.argsort(shares - exact, kind="stable")[: max(num_parts - shares.sum(), 0)]] += 1
-    return np.minimum(shares, weights)
 
 
 # --- Balanced k-means: parts of round shape and equal size ------------------------------------

@@ -385,8 +385,7 @@ class FaceSolver:
     def _enter(self, face: Face) -> bool:
         """Make projectors and preconditioner of a face; return whether it is the last one.
 
-        A curved face is made anew, with its new tangents. Along it the Hessian of q is, to second
-        order, F + Z diag(κ) Zᵀ.
+        A curved face is made anew; along it the Hessian of q is, to second order, F + Z diag(κ) Zᵀ.
         """
         qp, before = self._qp, self._face
         same = before is not None and not any_rank(qp.coarse.comm, face.status != before.status)

@@ -330,9 +330,13 @@ class Ellipses:
             return Face(free, status.ravel())
         n = normal[along]
         g = np.where(self._moves, g.reshape(self.semi_axes.shape), 0.0)
-        kappa = self._curvature(t, g, normal)[along]
+        # κ = (−nᵀg)⁺ τᵀHτ/‖Ht‖ with H = diag(a)⁻² and τ the tangent
+        pushing = np.maximum(-np.sum(g * normal, axis=1), 0.0)
+        slope = np.linalg.norm(self._inverse**2 * t, axis=1)
+        bent = np.sum(self._inverse**2 * normal[:, ::-1] ** 2, axis=1)
+        kappa = pushing * np.divide(bent, slope, out=0.0 * slope, where=slope > 0.0)
         rows, tangents = 2 * along[:, None] + (0, 1), np.stack((-n[:, 1], n[:, 0]), axis=1)
-        return Face(free, status.ravel(), rows, tangents, kappa)
+        return Face(free, status.ravel(), rows, tangents, kappa[along])
 
     def onto(self, x: Array, status: Array) -> Array:
         """The nearest points of the ellipses; of their boundary, from inside too, for slip."""
@@ -355,14 +359,6 @@ class Ellipses:
         size = np.linalg.norm(steep, axis=1, keepdims=True)
         normal = np.divide(steep, size, out=np.zeros_like(t), where=size > 0.0)
         return on | ~self._moves.any(axis=1), normal
-
-    def _curvature(self, t: Array, g: Array, normal: Array) -> Array:
-        """κ = (−nᵀg)⁺ τᵀHτ/‖Ht‖ with H = diag(a)⁻² and τ the tangent, shape ``(n,)``."""
-        pushing = np.maximum(-np.sum(g * normal, axis=1), 0.0)
-        inverse = self._inverse**2
-        slope = np.linalg.norm(inverse * t, axis=1)
-        bent = np.sum(inverse * normal[:, ::-1] ** 2, axis=1)
-        return np.asarray(pushing * np.divide(bent, slope, out=0.0 * slope, where=slope > 0.0))
 
     def _nearest(self, z: Array, which: Array) -> Array:
         """Return the nearest points of the boundary: a_j²z_j/(a_j² + μ)."""

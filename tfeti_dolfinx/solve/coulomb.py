@@ -86,9 +86,8 @@ def solve_with_friction(
 
     Problems with given bounds, of which the last one has to give the forces again that its bounds
     are of. The next bounds are those of Newton's method on the law or, where that is off or fails,
-    the last forces: a fixed point iteration. Arguments are those of ``solve_dual``. Return
-    multipliers, their displacement with its accuracy (of the last step; steps and looks are those
-    of all), and how the bounds have come to rest.
+    the last forces: a fixed point iteration. Arguments and result are those of ``solve_dual``, with
+    the steps and looks of all problems, and how the bounds have come to rest.
     """
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
         dual.bound_friction(None)  # there may have been coefficients

@@ -126,9 +126,8 @@ class Predictor:
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
         """Return the nearest displacement to w.
 
-        Raise a ConvergenceError where the solver stopped before its tolerance; a FactorError where
-        M could not be factored. w is in DOLFINx's order, as is this rank's mass M, whose factors
-        are kept while it is the same object; right sides of the rows are as before afterwards.
+        w is in DOLFINx's order, as is this rank's mass M, whose factors are kept while it is the
+        same object; right sides of the rows are as before afterwards.
         """
         dofs, constraints = self._dofs, gluing.constraints
         before, primal = np.array(constraints.c), dofs.to_primal(w)

@@ -380,7 +380,15 @@ def subdomain_data(
     gdim = decomposition.mesh.geometry.dim
     x = dofs.points()[:, :gdim]
     shares = 1.0 / dofs.spread(dofs.multiplicity)
-    frames = _body_frames(dofs, decomposition, x, shares)
+    # centre and size of each body, the same on all ranks and for all subdomains
+    body = decomposition.body_of_subdomain[dofs.node_subdomain]
+    sums = np.zeros((decomposition.num_bodies, 1 + gdim))
+    np.add.at(sums, body, shares[:, None] * np.column_stack((np.ones(len(x)), x)))
+    dofs.comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
+    centre, length = sums[:, 1:] / sums[:, :1], np.zeros(len(sums))
+    np.maximum.at(length, body, np.linalg.norm(x - centre[body], axis=1))
+    dofs.comm.Allreduce(MPI.IN_PLACE, length, op=MPI.MAX)
+    frames = list(zip(centre, length.tolist(), strict=True))
     loads, starts = dofs.to_primal(f), (dofs.node_offsets * dofs.bs).tolist()
     cuts, dolfinx = np.searchsorted(trace, starts), dofs.dolfinx_dofs()
     primal = np.empty(len(dolfinx), dtype=np.int32)
@@ -409,18 +417,3 @@ def subdomain_stiffness(K: Any, rows: Array, primal: Array, first: int) -> csr_a
     A = csr_array((K.data[entries], columns, table), shape=(len(rows),) * 2)
     A.sort_indices()
     return A
-
-
-def _body_frames(
-    dofs: TornDofs, decomposition: Decomposition, x: Array, shares: Array
-) -> list[tuple[Array, float]]:
-    """Centre and size of each body, the same on all ranks and for all subdomains."""
-    body = decomposition.body_of_subdomain[dofs.node_subdomain]
-    sums = np.zeros((decomposition.num_bodies, 1 + x.shape[1]))
-    np.add.at(sums, body, shares[:, None] * np.column_stack((np.ones(len(x)), x)))
-    dofs.comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
-    centre = sums[:, 1:] / sums[:, :1]
-    length = np.zeros(decomposition.num_bodies)
-    np.maximum.at(length, body, np.linalg.norm(x - centre[body], axis=1))
-    dofs.comm.Allreduce(MPI.IN_PLACE, length, op=MPI.MAX)
-    return list(zip(centre, length.tolist(), strict=True))
