@@ -13,12 +13,7 @@ from test_qp import matrix, vector
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.friction_newton import (
-    Law,
-    LawPoint,
-    LawProgram,
-    newton_on_law,
-)
+from tfeti_dolfinx.qp.friction_newton import Law, LawPoint, LawProgram, newton_on_law
 from tfeti_dolfinx.qp.problem import QP
 
 SEEDS = st.integers(0, 1000)
@@ -96,13 +91,7 @@ def test_it_solves_the_law(seed, k, r):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"qp_type": "smalse"},
-        {"pc_type": "lumped"},
-        {"pc_type": "none"},
-    ],
+    "options", [{}, {"qp_type": "smalse"}, {"pc_type": "lumped"}, {"pc_type": "none"}]
 )
 def test_it_finds_what_the_fixed_point_finds(options):
     """With any solver and preconditioner."""

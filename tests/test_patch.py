@@ -83,12 +83,7 @@ def test_uniform_pressure_and_linear_displacement(cell, degree, subdomains, orde
     if moved:
         wavy(d)
     problem = two_body_problem(
-        d,
-        pressed(d, PRESSURE),
-        held(d, *sides_of(cell)),
-        [sided(*order)],
-        degree,
-        **TO_ROUNDING,
+        d, pressed(d, PRESSURE), held(d, *sides_of(cell)), [sided(*order)], degree, **TO_ROUNDING
     )
     problem.solve()
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)

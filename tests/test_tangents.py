@@ -92,10 +92,7 @@ def test_a_prescribed_tangent_leaves_a_row_without_entries():
     assert np.all(held.gluing.constraints.c[sets.tangents] == 0.0)
 
 
-@pytest.mark.parametrize(
-    ("cell", "counts"),
-    [("hexahedron", (4, 3)), ("tetrahedron", (5, 4))],
-)
+@pytest.mark.parametrize(("cell", "counts"), [("hexahedron", (4, 3)), ("tetrahedron", (5, 4))])
 def test_no_friction_across_a_plane_of_symmetry(cell, counts):
     """Where both bodies are held across it the rest that other nodes leave has no row.
 

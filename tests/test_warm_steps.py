@@ -42,10 +42,7 @@ def multiplications(scene, cold=False, **options):
     return np.mean(counts)
 
 
-@pytest.mark.parametrize(
-    ("scene", "most", "most_cold"),
-    [(bar, 1.0, 3.0), (ball, 8.5, 14.0)],
-)
+@pytest.mark.parametrize(("scene", "most", "most_cold"), [(bar, 1.0, 3.0), (ball, 8.5, 14.0)])
 def test_a_step_takes_two_thirds_of_one_that_begins_with_nothing(scene, most, most_cold):
     """0 of 2 multiplications, with friction 8 of 14."""
     warm, cold = multiplications(scene), multiplications(scene, cold=True, recycle=0)

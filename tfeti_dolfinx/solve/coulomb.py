@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,6 +57,9 @@ class CoulombParameters:
     # of the largest forces of normals on a body: those of a lighter one count as so large
     light: float = 1e-6
     rounding: float = 2e-16  # of ‖F‖‖λ‖, or of ‖d‖: no residual is less
+    # most steps of a problem with the bounds of the law, which begins at its answer: bounds that
+    # are rounding leave a body to be turned by rounding
+    confirming: int = 100
 
 
 @dataclass(frozen=True)
@@ -107,8 +110,10 @@ def solve_with_friction(
             rtol = least if near else max(least, min(rtol, parameters.share * change))
         asked = rtol if law is None else least
         exact = goal if asked <= least else None
+        most = options.max_it if law is None else min(options.max_it, parameters.confirming)
+        limited = replace(options, max_it=most)
         result, rule = solve_dual(
-            dual, options, qp_type, law or start, monitor, exact, make_rule, rtol=asked
+            dual, limited, qp_type, law or start, monitor, exact, make_rule, rtol=asked
         )
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         if result.reason <= 0:
