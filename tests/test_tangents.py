@@ -85,7 +85,7 @@ def test_a_prescribed_tangent_leaves_a_row_without_entries():
     assert held.count(~rows.moves) == 3
     along_x = np.abs(held.records.tangents[rows.condition, :, 0]) > 0.5
     assert np.array_equal(~rows.moves, along_x & on_left[:, None])
-    bound = rows.limits(np.full((len(held.records), 2), 0.5), held.records.area)
+    bound, _ = rows.bounds(np.full((len(held.records), 2), 0.5), held.records.area)
     assert np.all((bound > 0.0) == rows.moves)
     expected = 0.5 * held.records.area[rows.condition] / rows.scale
     assert np.allclose(bound.max(axis=1, initial=0.0), expected)

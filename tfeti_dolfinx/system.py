@@ -442,8 +442,8 @@ class System:
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
         self._known_friction = friction = search.friction()
-        gluing.constraints.limits[:] = gluing.tangents.limits(friction, area)
-        gluing.constraints.coefficients[:] = gluing.tangents.coefficients(friction)
+        constraints = gluing.constraints
+        constraints.limits[:], constraints.coefficients[:] = gluing.tangents.bounds(friction, area)
 
     def _assemble_load(self) -> None:
         self._f = self.elements.load(self.forms)

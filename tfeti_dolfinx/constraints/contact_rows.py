@@ -135,23 +135,16 @@ class TangentRows:
     # else −1, shape (t,)
     normal: Array
 
-    def limits(self, traction: Array, area: Array) -> Array:
-        """Return the ψ_i = traction · ∫φ_i / s_i, semi-axes of what λ_T may be, ``(t, gdim - 1)``.
+    def bounds(self, values: Array, area: Array) -> tuple[Array, Array]:
+        """Return ψ_i = traction · ∫φ_i / s_i, semi-axes of what λ_T may be, and Coulomb's μ_i.
 
-        They are 0 on empty rows and under Coulomb's law. Traction, shape ``(n, gdim - 1)``, and
-        area ∫φ_i, shape ``(n,)``, are those of all conditions.
+        Both have the shape ``(t, gdim - 1)``; one of them is 0, and on empty rows both. Tractions
+        or coefficients, ``(n, gdim - 1)``, and areas ∫φ_i, ``(n,)``, are those of all conditions.
         """
         over = (area[self.condition] / self.scale)[:, None]
-        given = self.moves & (self.normal < 0)[:, None]
-        return np.where(given, traction[self.condition] * over, 0.0)
-
-    def coefficients(self, values: Array) -> Array:
-        """Return the μ_i, semi-axes over λ_N, from those of all conditions, ``(n, gdim - 1)``.
-
-        They are 0 on rows without entries and under a given bound. Shape ``(t, gdim - 1)``.
-        """
-        pressed = self.moves & (self.normal >= 0)[:, None]
-        return np.where(pressed, values[self.condition], 0.0)
+        own, given = values[self.condition], (self.normal < 0)[:, None]
+        limits = np.where(self.moves & given, own * over, 0.0)
+        return limits, np.where(self.moves & ~given, own, 0.0)
 
 
 def tangent_rows(
