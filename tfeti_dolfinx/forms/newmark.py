@@ -116,19 +116,9 @@ class Inertia:
     def M(self) -> csr_array:
         """This rank's M in DOLFINx's numbering."""
         if self._M is None:
-            M, bs = assemble_csr(self._m), self._V.dofmap.index_map_bs
-            expected = "a density, or a form such as ∫ρ u·v"
+            M = assemble_csr(self._m)
             with raised_on_all_ranks(self._comm):
-                check_stiffness("mass", M, "the matrix", expected)
-                for k in range(bs):
-                    along = np.zeros(M.shape[0])
-                    along[k::bs] = 1.0
-                    total, sizes = along @ (M @ along), M.diagonal() @ along
-                    if total <= 1e-10 * sizes and len(along):  # rounding of 0: M has a kernel
-                        raise InputError(
-                            f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; "
-                            f"expected {expected}"
-                        )
+                check_mass(M, self._V.dofmap.index_map_bs)
             self._M = M
         return self._M
 
@@ -193,6 +183,24 @@ class InertialForms(Forms):
     def elastic(self, u: Array) -> float:
         """Return this rank's part of uᵀKu/2."""
         return float(0.5 * u @ (self.K @ u))
+
+
+def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:
+    """Raise an InputError unless this rank's matrix is that of a mass in every direction.
+
+    ``rounding`` is the share of the sum of the diagonal up to which the mass of a translation is 0,
+    as where M has a kernel.
+    """
+    check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
+    for k in range(bs):
+        along = np.zeros(M.shape[0])
+        along[k::bs] = 1.0
+        total, sizes = along @ (M @ along), M.diagonal() @ along
+        if total <= rounding * sizes and len(along):
+            raise InputError(
+                f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; expected a "
+                "density, or a form such as ∫ρ u·v"
+            )
 
 
 def check_copies(values: Array, dofs: TornDofs, name: str, left: float = 1e-3) -> None:

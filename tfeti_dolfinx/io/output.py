@@ -71,8 +71,19 @@ def write_xdmf(
 ) -> list[Path]:
     """Write all fields of a solution to one XDMF file and its HDF5 companion. Collective.
 
-    Nodal fields are interpolated to the degree of the mesh geometry, which XDMF requires. Arguments
-    and errors are those of ``write_vtx``; the name ends with ``.xdmf``.
+    Nodal fields are interpolated to the degree of the mesh geometry, which XDMF requires.
+
+    Args:
+        path: A name that ends with ``.xdmf``.
+        solution: The solution.
+        interior: As for ``write_vtx``.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: The name does not end with ``.xdmf``, or the files cannot be written there, as
+            where the disk is full; then what was there before stays.
     """
     target = checked_target(path, ".xdmf", solution, interior)
     comm, mesh = solution.decomposition.comm, solution.decomposition.mesh
@@ -104,8 +115,19 @@ def write_pvd(
     """Write all fields of a solution for PyVista and ParaView. Collective.
 
     All fields are in one grid, those of nodes with the displacement's degree. The file names its
-    parts, ``<stem>000000.pvtu`` and ``<stem>_p0_000000.vtu`` of each rank. Arguments and errors are
-    those of ``write_vtx``; the name ends with ``.pvd``.
+    parts, ``<stem>000000.pvtu`` and ``<stem>_p0_000000.vtu`` of each rank.
+
+    Args:
+        path: A name that ends with ``.pvd``.
+        solution: The solution.
+        interior: As for ``write_vtx``.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: The name does not end with ``.pvd``, or the files cannot be written there, as
+            where the disk is full; then what was there before stays.
     """
     target = checked_target(path, ".pvd", solution, interior)
     return _one_step(target, solution, interior)

@@ -258,7 +258,11 @@ def _gaps(
 def _apart(
     kind: FacetKind, secondary: Facets, primary: Facets, at: FacingPoints, curved: bool
 ) -> Array:
-    """Vectors along the normal at the point, of the vertices, that close the gap: ``(m, gdim)``."""
+    """Vectors along the surface's normal that close the gap, shape ``(m, gdim)``.
+
+    From one facet to the other one looks along the normal of a whole facet; what closes the gap
+    of curved bodies is the part along the normal at the point, interpolated from the vertices.
+    """
     there = points(kind.geometry, primary.x[at.primary], at.eta)
     here = points(kind.geometry, secondary.x[at.secondary], at.xi)
     if curved:

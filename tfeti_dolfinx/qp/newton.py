@@ -471,7 +471,10 @@ class FaceSolver:
         return z
 
     def _unseen(self, way: Array, Fw: Array) -> tuple[Array, Array]:
-        """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see."""
+        """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see.
+
+        What PCPG has left of the others in w is small beside it, but its bounds would end the way.
+        """
         qp, given = self._qp, self._parameters
         exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
         program = replace(self._on_face, F=qp.F, d=Fw, recycled=None)

@@ -464,7 +464,10 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         super()._find()
 
     def _project_velocity(self) -> None:
-        """Start with the velocity that goes to the prediction; what contact takes is a blow."""
+        """Start with the velocity that goes to the prediction; what contact takes is a blow.
+
+        What a node keeps of the velocity with which it hits would work where normals turn.
+        """
         motion, predictor = self._newton_forms.inertia.motion, self._predictor
         motion.start, self._blows = motion.v, []
         if predictor is None or predictor.multipliers is None:
