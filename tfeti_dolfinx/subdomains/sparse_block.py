@@ -273,13 +273,15 @@ class SparseBlock(Block):
 
     def set_stiffness(self, K: Any) -> None:
         """Take a stiffness."""
-        if self.equals is not None:
-            stiffness, self.place = self.equals.find(self.name, self.x, K)
-        else:
-            stiffness = Stiffness(self.name, self.x, K, self._how)
-            self.place = np.arange(K.shape[0])
+        stiffness, self.place = self._found(K)
         self._stiffness: Stiffness | None = stiffness
         self.diagonal, self.kernel = stiffness.diagonal[self.place], stiffness.kernel[self.place]
+
+    def _found(self, K: Any) -> tuple[Stiffness, Array]:
+        """Return a Stiffness of K, and the place of each unknown in it; boundary elements' else."""
+        if self.equals is not None:
+            return self.equals.find(self.name, self.x, K)
+        return Stiffness(self.name, self.x, K, self._how), np.arange(K.shape[0])
 
     @property
     def stiffness(self) -> Stiffness:
