@@ -139,12 +139,12 @@ def solve_with_friction(
                 result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
                 break
         # Step 4: the next bounds: of Newton's method on the law, or those forces
-        # where nothing was to do the change tells nothing of the error of bounds
-        rtol *= parameters.share if result.steps.inner == 0 and law is None else 1.0
+        # where nothing was to do the change tells nothing of the error of bounds: finer, first
+        moved = law is not None or result.steps.inner > 0
+        rtol *= 1.0 if moved else parameters.share
         start = law or (result.lam, result.mu)
         bounds.advance()
-        # so near problems would follow the rounding of a method that has not come there itself
-        law = None if near and newton.steps == 0 else newton.solve(start, bounds, aim)
+        law = newton.solve(start, bounds, aim) if moved else None
         holds = law is not None or bounds.hold()
         if not holds or bounds.idle > parameters.patience or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
