@@ -53,7 +53,7 @@ def hertz(x):
 # ## Meshes
 #
 # gmsh makes them on rank 0, a coarse uniform one at first, then from the sizes that the last
-# estimate asks for.
+# estimate wants.
 
 
 # +

@@ -53,7 +53,7 @@ def hertz(r):
 # ## Meshes
 #
 # gmsh makes them on rank 0, a coarse uniform one at first, then from the sizes that the last
-# estimate asks for. A subdomain has about 4000 unknowns.
+# estimate wants. A subdomain has about 4000 unknowns.
 
 
 # +

@@ -21,7 +21,7 @@ parser.add_argument("--quick", action="store_true", help="a size of a few second
 parser.add_argument(
     "--balls", type=int, default=8, choices=range(3, 15), metavar="N", help="their number, 3 to 14"
 )
-parser.add_argument("--unknowns", type=int, help="about so many unknowns")
+parser.add_argument("--unknowns", type=int, help="number of unknowns, about")
 parser.add_argument("--subdomains", type=int, help="gmsh partitions")
 parser.add_argument("--large", action="store_true", help="700 subdomains, 1.7 M unknowns")
 parser.add_argument("--plot", action="store_true", help="draw pictures")
@@ -180,7 +180,7 @@ bcs = [
 
 # ## Contact
 #
-# A ball's whole sphere faces both grooves; only what is near is looked at.
+# A ball's whole sphere may meet both grooves; only what is near is searched.
 
 pairs = [(name, groove) for name in names for groove in ("inner groove", "outer groove")]
 contacts = [tfeti.Contact(*pair, secondary=pair[0], reach=0.006 * ball) for pair in pairs]

@@ -1,7 +1,7 @@
 # # A bolted joint
 #
 # Two plates, a bolt and a nut: four bodies that touch with Coulomb's friction. The nut is tightened
-# by a shortening: it stands on a shoulder of the bolt, in the place of a thread, and overlaps it.
+# by a shortening: it stands on a shoulder of the bolt, instead of a thread, and overlaps it.
 # Then one plate is pulled along the other. Up to the force μN, N the pretension, they stick; then
 # they slide and bend the bolt, until that slides under its head, too. So the joint carries μN
 # without sliding, and 2μN with both sides of a plate. The hole is so wide that the shank does not

@@ -2,7 +2,7 @@
 #
 # An elastic bar falls on a rigid floor (Doyen, Ern, Piperno, SIAM J. Sci. Comput. 33, 2011). It is
 # in contact while a wave runs up the bar and back, leaves the floor, and falls again. After its
-# second impact it is where it was at the begin: the motion is periodic, in closed form.
+# second impact it is where it was at the start: the motion is periodic, in closed form.
 #
 #     ./run mpirun -n 2 python3 demos/bouncing_bar.py --plot
 

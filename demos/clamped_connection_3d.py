@@ -3,7 +3,7 @@
 # A mine support yields: two U-profiles overlap, and two bolted clamps press them on each other,
 # so that they slide before they bend. Here the load along the support is below what friction can
 # take: a part of the contact slips, the rest sticks. Six bodies, five contacts with Coulomb's
-# friction, which alone holds the upper profile along its axis. Dostál's talk has such a scene of
+# friction, which alone holds the upper profile along its axis. Dostál's talk has such a model of
 # 1.6 million unknowns in 250 subdomains (`--large`); it does not say its measures.
 #
 #     ./run mpirun -n 2 python3 demos/clamped_connection_3d.py --plot
@@ -181,7 +181,7 @@ for name, across in (("upper end", (0, 1)), ("bolts below", (0, 2)), ("bolts abo
 # ## Contact
 #
 # Nearly all nodes of the bars slip. Newton's method on Coulomb's law does not mind; problems
-# with given bounds alone (`-tfeti_friction_type fixed_point`) take longer.
+# with fixed bounds alone (`-tfeti_friction_type fixed_point`) take longer.
 
 law = tfeti.Coulomb(arguments.friction)
 pairs = {"upper outside": "lower inside"}

@@ -1,7 +1,7 @@
 # # A cube on a curved obstacle
 #
-# The frictionless 3D scene of the benchmark tables: a unit cube of N × N × N equal subdomains,
-# fixed on one face, pressed from above on a curved rigid obstacle.
+# The frictionless 3D model of the benchmark tables: a unit cube of N × N × N equal subdomains,
+# fixed on one side, pressed from above on a curved rigid obstacle.
 #
 #     ./run mpirun -n 2 python3 demos/cube_3d.py --subdomains 64
 

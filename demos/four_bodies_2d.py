@@ -1,7 +1,7 @@
-# # Four bodies with given friction
+# # Four bodies with Tresca's friction
 #
 # A wedge is driven between two blocks that stand on a base: four bodies in eight subdomains, four
-# contacts with Tresca's friction. Contact alone holds the wedge. Dostál's talk has a scene of four
+# contacts with Tresca's friction. Contact alone holds the wedge. Dostál's talk has a model of four
 # bodies, 67 330 unknowns and 8 subdomains, and does not say what it looks like.
 #
 #     ./run mpirun -n 2 python3 demos/four_bodies_2d.py --plot
@@ -14,7 +14,7 @@ from pathlib import Path
 import petsc4py
 
 parser = argparse.ArgumentParser(
-    description="A wedge between two blocks on a base: four bodies, given friction."
+    description="A wedge between two blocks on a base: four bodies, Tresca friction."
 )
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--cells", type=int, help="quadrilaterals along a side of a subdomain")

@@ -17,7 +17,7 @@ parser = argparse.ArgumentParser(
     description="An elastic half ball on a rigid plane: Hertz contact in 3D."
 )
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
-parser.add_argument("--unknowns", type=int, help="about so many unknowns")
+parser.add_argument("--unknowns", type=int, help="number of unknowns, about")
 parser.add_argument("--subdomains", type=int, help="their number")
 parser.add_argument("--plot", action="store_true", help="draw pictures")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")

@@ -17,7 +17,7 @@ parser = argparse.ArgumentParser(
     description="A rigid ball pressed into an elastic body, by displacement and by force."
 )
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
-parser.add_argument("--unknowns", type=int, help="about so many unknowns")
+parser.add_argument("--unknowns", type=int, help="number of unknowns, about")
 parser.add_argument("--plot", action="store_true", help="draw pictures")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")

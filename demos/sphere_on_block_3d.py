@@ -16,7 +16,7 @@ parser = argparse.ArgumentParser(
     description="A ball on a block: Hertz contact of two elastic bodies in 3D, a quarter."
 )
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
-parser.add_argument("--unknowns", type=int, help="about so many unknowns")
+parser.add_argument("--unknowns", type=int, help="number of unknowns, about")
 parser.add_argument("--subdomains", type=int, help="their number")
 parser.add_argument("--exchange", action="store_true", help="let the ball be the secondary side")
 parser.add_argument("--plot", action="store_true", help="draw pictures")

@@ -1,6 +1,6 @@
 # # A cube of boundary elements on a curved obstacle
 #
-# The scene of `cube_3d.py` with boundary elements in all subdomains, each a cube of 9 × 9 × 9
+# The model of `cube_3d.py` with boundary elements in all subdomains, each a cube of 9 × 9 × 9
 # cells: 1464 unknowns on its surface, as in Dostál's table of Total BETI. Boundary elements read
 # their moduli from the bilinear form, and the mesh inside serves for pictures alone.
 #

@@ -1,7 +1,7 @@
-# # A square with given friction
+# # A square with Tresca's friction
 #
-# The 2D scene of the talk's table with Tresca friction: a unit square fixed on one side, pressed on
-# a rough line and pulled along it. The subdomains are equal squares of 50 × 50 elements.
+# The 2D model of Dostál's table with Tresca's friction: a unit square fixed on one side, pressed
+# on a rough line and pulled along it. The subdomains are equal squares of 50 × 50 elements.
 #
 #     ./run mpirun -n 2 python3 demos/tresca_2d.py --subdomains 16
 
@@ -12,9 +12,7 @@ from pathlib import Path
 
 import petsc4py
 
-parser = argparse.ArgumentParser(
-    description="A square on a rough line, friction with a given bound."
-)
+parser = argparse.ArgumentParser(description="A square on a rough line, Tresca friction.")
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--subdomains", type=int, default=16, help="their number, a square")
 parser.add_argument("--cells", type=int, help="quadrilaterals along an edge of a subdomain")

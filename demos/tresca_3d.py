@@ -1,9 +1,9 @@
-# # A cube with given friction
+# # A cube with Tresca's friction
 #
-# The 3D scene of the talk's table with Tresca friction: a unit cube fixed on one face, pressed on a
-# rough plane and pushed along it. The subdomains are equal cubes of 10 × 10 × 10 elements. Four of
-# them make the half next to the fixed face, which does not slide as far: its bound is lower. 1024
-# make a body of twice the length, which slides further: its bound is higher.
+# The 3D model of Dostál's table with Tresca's friction: a unit cube fixed on one side, pressed on
+# a rough plane and pushed along it. The subdomains are equal cubes of 10 × 10 × 10 elements. Four
+# of them make the half next to the fixed side, which does not slide as far: its bound is lower.
+# 1024 make a body of twice the length, which slides further: its bound is higher.
 #
 #     ./run mpirun -n 2 python3 demos/tresca_3d.py --subdomains 64
 
@@ -14,9 +14,7 @@ from pathlib import Path
 
 import petsc4py
 
-parser = argparse.ArgumentParser(
-    description="A cube on a rough plane, friction with a given bound."
-)
+parser = argparse.ArgumentParser(description="A cube on a rough plane, Tresca friction.")
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--subdomains", type=int, choices=(1, 4, 8, 64, 512, 1024), default=4)
 parser.add_argument("--cells", type=int, help="hexahedra along an edge of a subdomain")

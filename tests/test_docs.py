@@ -166,7 +166,8 @@ def prose(path):
 # what users read as constraints, iterations, active sets, expensive, instead of, compared with
 UNSAID = re.compile(
     r"\b(multiplications?|rows?|faces?(?! (away|each|them|it)\b)|dear(er)?|prices?|scenes?|hats?"
-    r"|given bounds?|in the place of|beside|as ever|likewise|just if|right to)\b"
+    r"|given (bounds?|friction)|(in|takes?) the place of|asks? for|the begin|about so many|beside"
+    r"|as ever|likewise|just if|right to)\b"
 )
 
 
@@ -190,6 +191,8 @@ def test_what_users_read_has_their_words():
     texts = [prose(path) for path in USER_PAGES]
     core = (ROOT / "tfeti_dolfinx").rglob("*.py")
     texts += [strings_of(path) for path in core if path.name != "testing.py"]
+    for demo in (ROOT / "demos").glob("*.py"):  # the site has their texts
+        texts += re.findall(r"^ *# .*$", demo.read_text(), re.MULTILINE)
     for_users = (ROOT / "docs/api.md").read_text().partition("## To extend")[0]
     texts += public_docstrings(set(re.findall(r"auto\w+:: ([\w.]+)", for_users)))
     texts = [re.sub(r"`[^`]*`", "", text) for text in texts]

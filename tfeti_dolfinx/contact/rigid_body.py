@@ -93,7 +93,7 @@ def rotation_vector(motion: Array, gdim: int) -> Array:
 class RigidBody:
     """A rigid tool: a shape that moves by a law, or under a force.
 
-    It takes the place of an obstacle's shape. Motions are translations ``"x"``, ``"y"``,
+    It stands where an obstacle has its shape. Motions are translations ``"x"``, ``"y"``,
     ``"z"`` and turns about axes through ``point``: ``"rz"`` in 2D, ``"rx"``, ``"ry"``, ``"rz"``.
     Those in ``free`` are found, so that contact balances force and moment; others are those of
     the law. Surfaces that touch it are its bearings: a tool of several obstacles is one body.

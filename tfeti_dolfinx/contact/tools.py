@@ -243,7 +243,7 @@ class Tools:
             if contacts[i].gap == GEOMETRY and overlap[i] > SEARCH.inside * self._sizes[body]:
                 raise InputError(
                     f"{self.bodies[body].name} is inside of {contacts[i].surfaces[0]!r} at the "
-                    f"begin, {overlap[i]:.4g} deep; expected a rigid body outside, or touching "
+                    f"start, {overlap[i]:.4g} deep; expected a rigid body outside, or touching "
                     "(gap= says what else is meant, as a press fit)"
                 )
 

@@ -74,7 +74,7 @@ class SearchTolerances:
     samples: int = 16
     same_direction: float = 0.5  # cosine of 60°, up to which a gradient may be off the difference
     same_length: float = 100.0  # factor up to which its length may be
-    # how deep a rigid body may lie in a surface at the begin, over the surface's extent: facets of
+    # how deep a rigid body may lie in a surface at the start, over the surface's extent: facets of
     # a curved surface reach that far into what touches it
     inside: float = 0.01
     along: float = 1e-3  # a direction whose tangential part is shorter does not say where it points

@@ -132,7 +132,7 @@ class NewtonForms(Forms):
 class InertialNewtonForms(NewtonForms):
     """Matrix and load of the linearised problem in a time step of bodies with mass.
 
-    The trapezoidal rule, with the residual F at the begin and at the end of the step τ and w = u +
+    The trapezoidal rule, with the residual F at the start and at the end of the step τ and w = u +
     τv, or what takes its place: R(u⁺) = (F(u) + F(u⁺))/2 + 2M(u⁺ − w)/τ², and its derivative J/2 +
     2M/τ². M is that of the bodies where they were. Creation and all methods are collective.
     ``inertia`` has M, and where the step begins; its loads are −F.

@@ -54,7 +54,7 @@ class IsotropicHardening:
     Creation raises an InputError where a number does not fit; the message names it.
     """
 
-    # yield stress at the begin, a force per area, a number or numbers at points
+    # yield stress at the start, a force per area, a number or numbers at points
     yield_stress: Array
     hardening: Array  # linear hardening modulus, a force per area, likewise
     saturation: Array  # what the yield stress gains by Voce's hardening in the end, likewise
@@ -233,7 +233,7 @@ class J2Plasticity(Plasticity):
     Args:
         elasticity: The elastic law; its moduli may differ from point to point.
         u: The displacement.
-        yield_stress: Yield stress at the begin, a force per area, more than 0. As moduli of
+        yield_stress: Yield stress at the start, a force per area, more than 0. As moduli of
             ``elasticity`` it may be a number, one for each volume by its name, a constant, a
             function or UFL on the torn mesh, and so may be what hardens.
         hardening: Linear hardening modulus, a force per area, 0 or more.

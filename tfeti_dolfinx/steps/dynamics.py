@@ -210,18 +210,18 @@ class ContactDynamics(ContactProblem):
 
     Args:
         a: Bilinear form of the stiffness.
-        L: Linear form of the load. Its values when the problem is made are those at the begin of
+        L: Linear form of the load. Its values when the problem is made are those at the start of
             the first step, at each solve those at the end of the step; between them it is linear.
         bcs: Dirichlet conditions, at the end of the step.
         contacts: Obstacles and pairs. Friction acts on what slips in a step.
         decomposition: The torn mesh.
         mass: Mass per volume, a number, a scalar in UFL or numbers for all volumes by names, for
             M = ∫ρ u·v. Or a bilinear form.
-        velocity: Velocity at the begin, a function; default 0.
+        velocity: Velocity at the start, a function; default 0.
         stabilised: Whether steps are contact-stabilised.
         lumped: Whether a density is integrated at the vertices, which makes M diagonal; of elements
             of degree 1 only: vertices alone are too few for others.
-        others: As for ``ContactProblem``. What ``u`` has is the displacement at the begin.
+        others: As for ``ContactProblem``. What ``u`` has is the displacement at the start.
 
     Attributes:
         u: The displacement at the end of the step.
@@ -257,7 +257,7 @@ class ContactDynamics(ContactProblem):
         v = np.zeros_like(self.u.x.array)
         if velocity is not None:
             v = self._checked_u(velocity, self.dofs.V, "velocity").x.array
-        check_copies(self.u.x.array, self.dofs, "u, the displacement at the begin,")
+        check_copies(self.u.x.array, self.dofs, "u, the displacement at the start,")
         check_copies(v, self.dofs, "velocity")
         self._forms_in_time.inertia.move(np.array(self.u.x.array), np.array(v))
         self._predictor: Predictor | None = None
@@ -397,14 +397,14 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
     contact takes from the nodes that hit their velocity along the normal. All is collective.
 
     Args:
-        F: Residual F(u; v) without inertia. Internal variables are those at the begin of the step.
-        u: The displacement in F, as it is at the begin.
+        F: Residual F(u; v) without inertia. Internal variables are those at the start of the step.
+        u: The displacement in F, as it is at the start.
         bcs: Dirichlet conditions, at the end of the step.
         contacts: Obstacles and pairs. Friction acts on what slips in a step.
         decomposition: The torn mesh.
         mass: Mass per volume of the mesh as it was, or its bilinear form; see ``ContactDynamics``.
         finite: Whether strains and displacements are finite.
-        velocity: Velocity at the begin, a function; default 0.
+        velocity: Velocity at the start, a function; default 0.
         stabilised: Whether steps are contact-stabilised.
         lumped: Whether a density is integrated at the vertices.
         others: As for ``NonlinearContactProblem``.
