@@ -45,6 +45,7 @@ from benchmarks.pressures import Array, errors
 from benchmarks.tools import (
     FILE,
     Tables,
+    column,
     command_line,
     configure_clock,
     curves,
@@ -398,19 +399,15 @@ def study(name: str, arguments: Any, folder: Path) -> Tables:
 
 def draw(path, tables):
     """Errors over seconds, on one rank: a row of panels for each scene, energy and pressure."""
-    titles = [title for title in tables if title in SCENES]
-    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "ncols": 2}
-    with picture(path, len(MEASURES), 4.3 * len(titles), rows=len(titles)) as axes:
-        for k, title in enumerate(titles):
+    scenes = {title: rows for title, rows in tables.items() if title in SCENES}
+    labels = dict.fromkeys(row["meshes"] for rows in scenes.values() for row in rows)
+    names = [label for label in labels if not label.endswith("ranks")]
+    with picture(path, len(MEASURES), 4.3 * len(scenes), rows=len(scenes)) as axes:
+        for k, (title, rows) in enumerate(scenes.items()):
+            own = {of: [row for row in rows if row["meshes"] == of] for of in names}
             for panel, name in zip(axes[2 * k :], MEASURES, strict=False):
-                lines: dict[str, tuple[list[float], list[float]]] = {}
-                for row in tables[title]:
-                    if not row["meshes"].endswith("ranks"):
-                        x, y = lines.setdefault(row["meshes"], ([], []))
-                        x.append(row["seconds"])
-                        y.append(row[name])
-                curves(panel, title, ("seconds", f"relative error, {name}"), lines)
-                panel.legend(fontsize="small", **below)
+                lines = {of: (column(g, "seconds"), column(g, name)) for of, g in own.items() if g}
+                curves(panel, title, ("seconds", f"relative error, {name}"), lines, names=names)
 
 
 def configure(parser):

@@ -30,6 +30,7 @@ STAGES = ("mesh", "assembly", "contact", "constraints", "factors", "coarse", "so
 # lines of what a program has printed that are shown where it fails
 SHOWN = 20
 FEW = 8  # values that all can stand beside an axis
+BELOW = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "ncols": 2}  # a large legend
 
 Tables = dict[str, list[dict[str, Any]]]
 
@@ -320,10 +321,11 @@ def curves(
     labels: tuple[str, str],
     lines: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     log: str = "xy",
+    names: Sequence[str] = (),
 ) -> None:
-    """A curve for each name, the axes of ``log`` logarithmic."""
+    """A curve for each name, the axes of ``log`` logarithmic; one of ``names`` has its colour."""
     for name, (x, y) in lines.items():
-        axes.plot(x, y, marker="o", label=name)
+        axes.plot(x, y, marker="o", label=name, color=f"C{names.index(name)}" if names else None)
     if "x" in log:
         axes.set_xscale("log")
         plain(axes.xaxis, sorted({value for x, _ in lines.values() for value in x}))
@@ -336,7 +338,7 @@ def curves(
     axes.set_ylabel(labels[1])
     axes.set_title(title, fontsize="medium")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize="small")
+    axes.legend(fontsize="small", **(BELOW if len(lines) > 4 or names else {}))
 
 
 def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
