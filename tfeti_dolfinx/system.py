@@ -16,7 +16,7 @@ from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
-from tfeti_dolfinx.contact.records import ContactRecords, condition_areas, slips
+from tfeti_dolfinx.contact.records import ContactRecords, Friction, condition_areas, slips
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -277,8 +277,10 @@ class System:
                 self.change("right side")
             self._conditions = given
         if self._search is not None and self._known_friction is not None:
-            friction = self._search.friction()
-            if any_rank(comm, not np.array_equal(friction, self._known_friction)):
+            known, friction = self._known_friction, self._search.friction()
+            if any_rank(comm, not np.array_equal(friction > 0.0, known > 0.0)):
+                self.change("constraints")
+            elif any_rank(comm, not np.array_equal(friction, known)):
                 self.change("friction")
 
     def change(self, what: str) -> None:
@@ -418,10 +420,15 @@ class System:
         if self.weights is None or not self.follows:
             scaling = self._settings.options.scaling
             self.weights = row_weights(self._blocks, scaling, dofs.comm)
+        records = search.records
+        if self._has_friction:  # a bound of 0 has no rows
+            self._known_friction = search.friction()
+            rubs = np.any(self._known_friction > 0.0, axis=1)
+            records = replace(records, friction=np.where(rubs, records.friction, Friction.NONE))
         self._gluing = glue(
             dofs,
             made(self._prescribed),
-            search.records,
+            records,
             search.length,
             self.weights,
             slip=self._slip(),

@@ -32,7 +32,7 @@ NOT_NEGATIVE = Range("a number, 0 or more", lambda value: value >= 0.0)
 
 
 class FrictionLaw:
-    """One or two values of a bound on the tangential traction."""
+    """One or two values of a bound on the tangential traction; where it is 0, points only touch."""
 
     what: ClassVar[str]  # name of the attribute that has the values
     kind: ClassVar[Friction]
