@@ -296,7 +296,7 @@ class Seconds(dict[str, float]):
 
 
 PRINTED = 10  # of a list; all of it is in the file
-WIDTH = 100  # of the printed lines
+WIDTH = 100  # of the printed lines, but for those of contacts: each has one
 SHOWN = ("displacement_error", "penetration", "balance")  # residuals of the short report
 # what adds up over solves, in ``in_all``
 COUNTERS = [f.name for kind in (SolverCounts, StageCounts) for f in fields(kind) if f.default == 0]
@@ -382,7 +382,8 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         ]
         head = f"tfeti_dolfinx: {self.converged_reason}" + f", solve {solves}" * (solves > 1)
         wrapped = TextWrapper(WIDTH, subsequent_indent=" " * 12, break_on_hyphens=False)
-        lines = [wrapped.fill(f"  {name:<9} {text}") for name, text in rows if text]
+        said = [f"  {name:<9} {text}" for name, text in rows if text]
+        lines = [line if line.startswith("  contact ") else wrapped.fill(line) for line in said]
         return "\n".join([head, *lines]).replace("\xa0", " ")
 
     def _measured(self, name: str) -> str:
