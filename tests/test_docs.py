@@ -133,6 +133,8 @@ NOT_RUN = {
     "python3 -m venv ": "the package is built by test_the_wheel_has_what_it_needs",
     "venv/bin/python -m pip install ": "the same; the wheel of DOLFINx is a download of 1.3 GB",
     "export LD_LIBRARY_PATH=": "of that wheel",
+    "conda env create -f environment/": "conda-forge is not within reach of the tests",
+    "docker build -f environment/": "a daemon is not, either",
     "mpirun -n 2 python demos/": "of that wheel; tests/test_demos.py runs the demo",
     "./run python3 -m benchmarks.stress": "tests/test_stress.py runs a few scenes",
     "./run python3 benchmarks/": "tests/test_benchmarks.py runs the quick sizes",
