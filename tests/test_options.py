@@ -81,7 +81,7 @@ def test_the_document_has_the_table():
         name = f"`-tfeti_{option.name}`"
         lines.append(f"| {name} | {about.algorithm} | {shown} | {about.text}{values} |")
     table = "\n".join(lines)
-    assert table in (ROOT / "docs/options.md").read_text(), table
+    assert table in (ROOT / "docs/developers/options.md").read_text(), table
 
 
 def test_options_of_factors_are_let_through_and_no_others():
