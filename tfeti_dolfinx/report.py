@@ -6,7 +6,7 @@ import json
 import resource
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from textwrap import TextWrapper
@@ -348,12 +348,8 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         return {of.name: getattr(self, of.name) for of in fields(Sizes)}
 
     def __str__(self) -> str:
-        sizes = (
-            (self.primal_dofs, "unknowns"),
-            (self.bodies, "bodies"),
-            (self.subdomains, "subdomains"),
-            (self.ranks, "ranks"),
-        )
+        numbers = (self.primal_dofs, self.bodies, self.subdomains, self.ranks)
+        sizes = zip(numbers, ("unknowns", "bodies", "subdomains", "ranks"), strict=True)
         work = (
             (self.F_multiplications, "iterations"),
             (self.preconditioner_multiplications, "preconditioned"),
@@ -367,7 +363,12 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         most = sorted(self.seconds.items(), key=lambda item: -item[1])
         stages = [f"{name}\xa0{s:.2g}" for name, s in most if name != "total" and s >= 0.005]
         seconds = f": {', '.join(stages)}" * bool(stages)
-        accuracy = [self._measured(name) for name in SHOWN if name in self.residuals]
+        accuracy = [
+            f"{name.replace('_', ' ')} {self.residuals[name]:.1e}"
+            + f" (allowed {self.tolerances.get(name, 0.0):.1e})" * bool(self.tolerances.get(name))
+            for name in SHOWN
+            if name in self.residuals
+        ]
         rest, warned = len(self.contacts) - PRINTED, len(self.warnings)
         rows = [
             ("model", _counted(sizes)),
@@ -385,12 +386,6 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         said = [f"  {name:<9} {text}" for name, text in rows if text]
         lines = [line if line.startswith("  contact ") else wrapped.fill(line) for line in said]
         return "\n".join([head, *lines]).replace("\xa0", " ")
-
-    def _measured(self, name: str) -> str:
-        """Return a residual with its tolerance."""
-        allowed = self.tolerances.get(name)
-        text = f"{name.replace('_', ' ')} {self.residuals[name]:.1e}"
-        return text if not allowed else f"{text} (allowed {allowed:.1e})"
 
     def details(self) -> str:
         """Return all fields as text, one in a line."""
@@ -418,7 +413,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
                     partial.write_text(json.dumps(asdict(self), indent=2) + "\n")
 
 
-def _counted(numbers: Sequence[tuple[int, str]]) -> str:
+def _counted(numbers: Iterable[tuple[int, str]]) -> str:
     """Return numbers with what they count, in the plural; of those that are 0 the first alone."""
     one = {"bodies": "body"}
     return ", ".join(

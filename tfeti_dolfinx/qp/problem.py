@@ -329,6 +329,11 @@ class PrintMonitor:
     feasible: FeasibleSet
     multiplications: Callable[[], int]  # multiplications by F so far
 
+    def __post_init__(self) -> None:
+        """Print the head of the columns."""
+        if self.comm.rank == 0:
+            print("outer step                |gP|        |Qx|  touching  iterations", flush=True)
+
     def __call__(
         self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
     ) -> None:
@@ -337,10 +342,8 @@ class PrintMonitor:
         own = int(np.sum((face.status != Status.FREE) & face.carrying))
         touching = self.comm.allreduce(own)
         if self.comm.rank == 0:
-            known = f"{equality:.4e}" if equality >= 0.0 else " " * 10
+            known = f"{equality:.4e}" if equality > 0.0 else ""
+            figures = f"{projected_gradient:.4e}  {known:10s}  {touching:8d}"
             print(
-                f"{steps.outer:4d} {step:<13s} |gP| {projected_gradient:.4e}  "
-                f"|Qx| {known}  touching {touching:6d}  "
-                f"iterations {self.multiplications():5d}",
-                flush=True,
+                f"{steps.outer:5d} {step:<13s} {figures}  {self.multiplications():10d}", flush=True
             )
