@@ -266,7 +266,7 @@ class FrictionBounds:
             return 1.0
         way, turn = now - first, (found - now) - (of_first - first)
         along, size = summed(self._comm, np.array([-(way @ turn), turn @ turn]))
-        share = along / size if size > 0.0 else 1.0
+        share = along / size if along > 0.0 else 1.0  # else they run away, to other ones
         return float(steering(self._comm, np.clip(share, self._parameters.shortest, 1.0))[0])
 
     def fit(self, result: QPResult, rule: Accuracy) -> bool:
