@@ -174,7 +174,7 @@ class Diagnostics:
             yield (
                 f"{self._names(worst > LIMITS.locks)}: Poisson's ratio is about "
                 f"{(t - 2.0) / (2.0 * t - 2.0):.4g} and displacements have degree 1, which makes "
-                "it too stiff (locking); expected degree 2"
+                "it too stiff (locking) unless its law is selective; expected degree 2"
             )
 
     def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
