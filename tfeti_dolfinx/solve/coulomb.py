@@ -117,11 +117,12 @@ def solve_with_friction(
         )
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         if result.reason <= 0:
-            if law is not None:
-                newton.tries, dual.recycled, bounds.now = 0, newton.recycled, bounds.before
-            elif not bounds.turn(result.reason):
+            if law is None and not bounds.turn(result.reason):
                 break
-            law, holds = None, bounds.hold()
+            law = law and newton.go_on(
+                law, bounds, result.reason, parameters.looser * rule.tolerance
+            )
+            holds = law is not None or bounds.hold()
             if not holds:
                 result.reason = ConvergedReason.DIVERGED_FRICTION
                 break
@@ -328,6 +329,21 @@ class NewtonOnLaw:
         pairs = (dual.last.d, dual.d), (dual.last.e, dual.coarse.e)
         other = not all(np.array_equal(kept, now) for kept, now in pairs)
         self._rests = not any_rank(dual.coarse.comm, other)
+
+    def go_on(
+        self, law: tuple[Array, Array], bounds: FrictionBounds, reason: ConvergedReason, aim: float
+    ) -> tuple[Array, Array] | None:
+        """Go on from an answer whose problem wants more digits than it has itself, or go back.
+
+        Where friction lets a body slide, the law tells its place better than given bounds do. Else
+        bounds become those before the answer, and Newton's method is tried no more.
+        """
+        before, rounding = bounds.before, reason == ConvergedReason.DIVERGED_ROUNDING
+        again = self.solve(law, bounds, aim) if rounding else None
+        if again is None:
+            self.tries, self._dual.recycled, bounds.now = 0, self.recycled, before
+        bounds.before = before
+        return again
 
     def solve(
         self, start: tuple[Array, Array] | None, bounds: FrictionBounds, aim: float = np.inf
