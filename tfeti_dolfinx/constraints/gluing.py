@@ -341,8 +341,10 @@ class Gluing:
             (self.tangents, earlier.tangents, sets.tangents, before.tangents),
         ]
         for rows, rows_before, to, of in pairs:
-            keys = self._keys(rows), earlier._keys(rows_before)
-            _, new, old = np.intersect1d(*keys, return_indices=True)
+            at = (self.records, rows.condition), (earlier.records, rows_before.condition)
+            # of the contact and the node of each condition; no mesh has so many nodes
+            keys = [(records.contact[kept] << 40) + records.group[kept] for records, kept in at]
+            _, new, old = np.intersect1d(keys[0], keys[1], return_indices=True)
             ratio = rows_before.scale[old] / rows.scale[new]
             start[to[new]] = lam[of[old]] * ratio[:, None]
         return start
@@ -357,11 +359,6 @@ class Gluing:
         tangents = self.tangents.condition[np.isin(sets.tangents, rows).any(axis=1)]
         own = np.unique(self.records.contact[np.concatenate((normals, tangents))])
         return sorted(set().union(*self.dofs.comm.allgather(own.tolist())))
-
-    def _keys(self, rows: ContactRows | TangentRows) -> Array:
-        """Return a number for the contact and the node of each condition with such rows."""
-        kept, records = rows.condition, self.records
-        return (records.contact[kept] << 40) + records.group[kept]  # no mesh has so many nodes
 
 
 def glue(
