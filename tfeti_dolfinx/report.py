@@ -383,8 +383,8 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         ]
         head = f"tfeti_dolfinx: {self.converged_reason}" + f", solve {solves}" * (solves > 1)
         wrapped = TextWrapper(WIDTH, subsequent_indent=" " * 12, break_on_hyphens=False)
-        said = [f"  {name:<9} {text}" for name, text in rows if text]
-        lines = [line if line.startswith("  contact ") else wrapped.fill(line) for line in said]
+        said = [(name, f"  {name:<9} {text}") for name, text in rows if text]
+        lines = [line if name == "contact" else wrapped.fill(line) for name, line in said]
         return "\n".join([head, *lines]).replace("\xa0", " ")
 
     def details(self) -> str:

@@ -281,6 +281,7 @@ class System:
             if any_rank(comm, not np.array_equal(friction > 0.0, known > 0.0)):
                 self.change("constraints")
             elif any_rank(comm, not np.array_equal(friction, known)):
+                self._known_friction = friction
                 self.change("friction")
 
     def change(self, what: str) -> None:
@@ -422,8 +423,8 @@ class System:
             self.weights = row_weights(self._blocks, scaling, dofs.comm)
         records = search.records
         if self._has_friction:  # a bound of 0 has no rows
-            self._known_friction = search.friction()
-            rubs = np.any(self._known_friction > 0.0, axis=1)
+            friction = self._known_friction = search.friction()
+            rubs = np.any(friction > 0.0, axis=1)
             records = replace(records, friction=np.where(rubs, records.friction, Friction.NONE))
         self._gluing = glue(
             dofs,
@@ -448,8 +449,7 @@ class System:
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
-        self._known_friction = friction = search.friction()
-        constraints = gluing.constraints
+        constraints, friction = gluing.constraints, made(self._known_friction)
         constraints.limits[:], constraints.coefficients[:] = gluing.tangents.bounds(friction, area)
 
     def _assemble_load(self) -> None:

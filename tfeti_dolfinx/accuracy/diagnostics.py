@@ -371,8 +371,8 @@ def _free(outcome: Outcome) -> list[str]:
             f"active contacts do not hold {len(loose)} rigid motions{listed}: displacements "
             "that differ by them are as right"
         ]
-    many = "s are" if outcome.free_modes > 1 else " is"
+    are, them = ("s are", "them") if outcome.free_modes > 1 else (" is", "it")
     return [
-        f"{outcome.free_modes} rigid motion{many} free{listed}: nothing resists or drives "
-        f"{'them' if many == 's are' else 'it'}, the smallest displacement was taken"
+        f"{outcome.free_modes} rigid motion{are} free{listed}: nothing resists or drives {them}, "
+        "the smallest displacement was taken"
     ]
