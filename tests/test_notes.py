@@ -21,11 +21,9 @@ def test_contacts_none_of_which_touches_are_said(height):
         contact = p.report.contact()
         assert contact.touching == 0
         assert 0.0 < contact.gap < 0.5
-        assert said == [
-            f"no contact touches (smallest gap {contact.gap:.2g}): the displacement is that "
-            "without contacts"
-        ]
-        assert f"note      {said[0]}" in str(p.report)
+        text = f"no contact touches (smallest gap {contact.gap:.2g}): the displacement is that "
+        assert said == [f"{text}without contacts"]
+        assert f"notes     {said[0]}" in str(p.report)
     else:
         assert p.report.contacts[0].touching > 0
         assert said == []

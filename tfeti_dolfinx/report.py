@@ -295,8 +295,9 @@ class Seconds(dict[str, float]):
         return self[key] if key in self or self.RENAMED.get(key) in self else default
 
 
-PRINTED = 10  # of a list; all of it is in the file
+PRINTED = 10  # of a list, and lines but for those of contacts; all of it is in the file
 WIDTH = 100  # of the printed lines, but for those of contacts: each has one
+STAGES = 4  # whose seconds are printed, the longest
 SHOWN = ("displacement_error", "penetration", "balance")  # residuals of the short report
 # what adds up over solves, in ``in_all``
 COUNTERS = [f.name for kind in (SolverCounts, StageCounts) for f in fields(kind) if f.default == 0]
@@ -361,8 +362,8 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         )
         solves, total = self.in_all.get("solves", 0), self.seconds.get("total", 0.0)
         most = sorted(self.seconds.items(), key=lambda item: -item[1])
-        stages = [f"{name}\xa0{s:.2g}" for name, s in most if name != "total" and s >= 0.005]
-        seconds = f": {', '.join(stages)}" * bool(stages)
+        stages = [f"{name} {s:.2g}" for name, s in most if name != "total" and s >= 0.005]
+        seconds = f": {', '.join(stages[:STAGES])}" * bool(stages)
         accuracy = [
             f"{name.replace('_', ' ')} {self.residuals[name]:.1e}"
             + f" (allowed {self.tolerances.get(name, 0.0):.1e})" * bool(self.tolerances.get(name))
@@ -370,22 +371,22 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
             if name in self.residuals
         ]
         rest, warned = len(self.contacts) - PRINTED, len(self.warnings)
+        contacts = [f"  contact   {contact}" for contact in self.contacts[:PRINTED]]
+        contacts += [f"  contacts  and {rest} contacts more, see details()"] * (rest > 0)
+        # a tool's force is on its contacts' lines
+        moved = [t.partition(", force")[0].replace(": displacement", "", 1) for t in self.tools]
         rows = [
-            ("model", _counted(sizes)),
-            *(("contact", str(contact)) for contact in self.contacts[:PRINTED]),
-            *[("contacts", f"and {rest} contacts more, see details()")] * (rest > 0),
-            *(("tool", text) for text in self.tools),
-            ("accuracy", ", ".join(accuracy)),
-            ("solver", f"{self.solver}: {_counted(work)}"),
-            ("time", f"{total:.3g} s{seconds}; {self.peak_memory_mb:.0f} MB"),
-            *(("note", text) for text in self.notes),
-            *[("warnings", f"{warned} logged; report.warnings has the text")] * (warned > 0),
+            ("model", _counted(sizes), 1),
+            ("tools", f"moved: {'; '.join(moved)}" * bool(moved), 1),
+            ("accuracy", ", ".join(accuracy), 2),
+            ("solver", f"{self.solver}: {_counted(work)}", 2),
+            ("time", f"{total:.3g} s{seconds}; {self.peak_memory_mb:.0f} MB", 1),
+            ("warnings", f"{warned} logged; report.warnings has the text" * bool(warned), 1),
         ]
+        model, *lines = [line for row in rows for line in _wrapped(*row)]
         head = f"tfeti_dolfinx: {self.converged_reason}" + f", solve {solves}" * (solves > 1)
-        wrapped = TextWrapper(WIDTH, subsequent_indent=" " * 12, break_on_hyphens=False)
-        said = [(name, f"  {name:<9} {text}") for name, text in rows if text]
-        lines = [line if name == "contact" else wrapped.fill(line) for name, line in said]
-        return "\n".join([head, *lines]).replace("\xa0", " ")
+        lines += _wrapped("notes", "; ".join(self.notes), PRINTED - 2 - len(lines))
+        return "\n".join([head, model, *contacts, *lines])
 
     def details(self) -> str:
         """Return all fields as text, one in a line."""
@@ -421,6 +422,13 @@ def _counted(numbers: Iterable[tuple[int, str]]) -> str:
         for i, (number, name) in enumerate(numbers)
         if number or i == 0
     )
+
+
+def _wrapped(name: str, text: str, most: int) -> list[str]:
+    """Return the printed lines of a row, none of no text, at most so many."""
+    wrapper = TextWrapper(WIDTH, f"  {name:<9} ", " " * 12, break_on_hyphens=False)
+    wrapper.max_lines, wrapper.placeholder = most, " … see details()"
+    return wrapper.wrap(text)
 
 
 def _item(item: str | list[float] | dict[str, Any]) -> str:
