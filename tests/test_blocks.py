@@ -222,7 +222,7 @@ def test_a_factor_that_only_the_preconditioner_needs_fails_on_all_ranks(monkeypa
         return regularised(*given)
 
     monkeypatch.setattr(traced, "regularised", fails)
-    p = problem(d, (0.0, -0.05), tfeti_pc_type="dirichlet")
+    p = problem(d, (0.0, -0.05), tfeti_pc_type="dirichlet", tfeti_local_type="implicit")
     with pytest.raises(FactorError, match=r"subdomain \d: .*dirichlet preconditioner: out of mem"):
         p.solve()
 

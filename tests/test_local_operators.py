@@ -71,24 +71,31 @@ def test_all_forms_apply_the_same(cell, equal):
     """Also on subdomains with contact rows, with prescribed values, and of several shapes.
 
     K⁺ is compared on forces that are in balance: generalised inverses of a place of its own each
-    differ by rigid motions.
+    differ by rigid motions. S from a dense K⁺ is that through K_ii, which is made before.
     """
     d = cubes(cell) if equal else decomposed(cell, 4, 5)
     p, subdomains = made(d)
     alone, single = made(d, "implicit")
     w = random(len(subdomains.trace))
+    through_inside = single.local_operator("schur")
+    through_inside.prepare()
     for kind in KINDS:
         for s in (subdomains, single):
             expected = blockwise(s.blocks, kind, w)
             for form in ("implicit", "explicit"):
                 operator = GroupedOperator(s.blocks, kind, LocalChoice(form))
                 assert close(applied(operator, w), expected)
+    explicit, dense = made(d, "explicit")
+    traced = [block.traced for block in dense.blocks]
+    known = all(t.schur is not None for t in traced if len(t.inside) and len(t.trace))
+    assert d.comm.allreduce(known, op=MPI.LAND)
+    assert close(applied(dense.local_operator("schur"), w), applied(through_inside, w))
     R = subdomains.kernel_rows.toarray()
     balanced = w - R @ np.linalg.lstsq(R, w, rcond=None)[0]
     u, v = (applied(s.local_operator("pinv"), balanced) for s in (subdomains, single))
     assert close(balanced @ u, balanced @ v)
     check_operator(p.dual.F, d.comm, len(p.dual.d))
-    for item in (p, alone):
+    for item in (p, alone, explicit):
         item.destroy()
 
 

@@ -5,16 +5,7 @@ import sys
 import numpy as np
 import pytest
 import ufl
-from bodies import (
-    TO_ROUNDING,
-    boxes,
-    gathered,
-    held,
-    pressed,
-    searched,
-    sided,
-    two_body_problem,
-)
+from bodies import TO_ROUNDING, boxes, gathered, held, pressed, searched, sided, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI

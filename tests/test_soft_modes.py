@@ -33,13 +33,7 @@ def multiplications(stiffness, **options):
     return counted, soft
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"contact": False},
-        {"qp_type": "newton"},
-    ],
-)
+@pytest.mark.parametrize("options", [{"contact": False}, {"qp_type": "newton"}])
 def test_springs_cost_little(options):
     """From next to nothing to stiffer than the body."""
     without, none = multiplications(0.0, **options)

@@ -521,10 +521,7 @@ STAGES: dict[str, tuple[str, Callable[[System], None]]] = {
     "friction": ("constraints", System._set_friction_limits),
     "load": ("assembly", System._assemble_load),
     "factors": ("factors", System._factor),
-    "trace": (
-        "factors",
-        lambda system: system.subdomains.retrace(system.gluing.constraints.trace),
-    ),
+    "trace": ("factors", lambda system: system.subdomains.retrace(system.gluing.constraints.trace)),
     "coarse problem": ("coarse", System._make_dual),
     "linear term": ("coarse", lambda system: system.dual.update_load()),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from weakref import ref
 
 import basix
@@ -22,7 +23,7 @@ from tfeti_dolfinx.mesh.untorn import cell_entities
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.subdomains.sparse_block import stretch_over_shear
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock, stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Quality of cells -------------------------------------------------------------------------
@@ -124,13 +125,11 @@ class Diagnostics:
     def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
         """Sentences beside the ``outcome``, each of which names the thing. Collective."""
         if self._of is None or self._of() is not dual:
-            lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
+            lasting = (self._cells(), self._locking(dual.subdomains), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             # mean slopes of a displacement of each subdomain, (gdim, nodes)
-            x, bs = self._points(dual.subdomains), self._dofs.bs
-            parts = [p for _, p in dual.subdomains.elastic_parts]
-            nodes = [x[p.start // bs : p.stop // bs] for p in parts]
-            self._slopes = [np.linalg.pinv(own, EPSILON * len(x)) for own in nodes]
+            nodes = self._points(dual.subdomains)
+            self._slopes = [np.linalg.pinv(own, EPSILON * len(own)) for own in nodes]
         u = solution.u
         return [
             *_loose(outcome),
@@ -151,23 +150,26 @@ class Diagnostics:
                 "and iterations suffer from more than 10"
             )
 
-    def _hinges(self) -> Iterator[str]:
+    @cached_property
+    def _hinges(self) -> list[str]:
         """Bodies that a mesh joins in nodes alone."""
         names = self._decomposition.body_names
-        for (a, b), count in zip(*shared_by_bodies(self._decomposition), strict=True):
-            yield (
-                f"{names[a]}, {names[b]}: the mesh joins them in nodes alone ({count}), in no "
-                "facet: they are bodies of their own, and not joined; expected a common facet"
-            )
+        return [
+            f"{names[a]}, {names[b]}: the mesh joins them in nodes alone ({count}), in no facet: "
+            "they are bodies of their own, and not joined; expected a common facet"
+            for (a, b), count in zip(*shared_by_bodies(self._decomposition), strict=True)
+        ]
 
     def _locking(self, subdomains: Subdomains) -> Iterator[str]:
         """Displacements of degree 1 where a material hardly changes its volume."""
         if self._dofs.V.element.basix_element.degree > 1:
             return
-        x, ratios = self._points(subdomains), []
-        for block, part in subdomains.elastic_parts:
-            own = x[part.start // self._dofs.bs : part.stop // self._dofs.bs]
-            ratios.append(stretch_over_shear(own, self._dofs.bs, block.multiply))
+        ratios = [
+            block.stiffness.stretch_over_shear
+            if isinstance(block, SparseBlock)
+            else stretch_over_shear(x, self._dofs.bs, block.multiply)
+            for block, x in zip(subdomains.elastic, self._points(subdomains), strict=True)
+        ]
         worst = subdomains.body_maxima([ratios])[0]
         if np.any(worst > LIMITS.locks):
             t = float(worst.max())
@@ -258,14 +260,12 @@ class Diagnostics:
                     'expected gap="curved", a mesh of degree 2, or smaller facets'
                 )
 
-    def _points(self, subdomains: Subdomains) -> Array:
-        """Return points of this rank's primal nodes, from the middle of their subdomains on."""
+    def _points(self, subdomains: Subdomains) -> list[Array]:
+        """Return points of each subdomain's nodes on this rank, from their middle on."""
         gdim, bs = self._decomposition.mesh.geometry.dim, self._dofs.bs
         x = self._dofs.V.tabulate_dof_coordinates()[self._dofs.dolfinx_node, :gdim]
-        for _, part in subdomains.elastic_parts:
-            rows = slice(part.start // bs, part.stop // bs)
-            x[rows] -= x[rows].mean(axis=0)
-        return np.asarray(x)
+        parts = [x[p.start // bs : p.stop // bs] for _, p in subdomains.elastic_parts]
+        return [own - own.mean(axis=0) for own in parts]
 
     def _names(self, which: Array) -> str:
         """Return names of bodies, the first ones if they are many; the same on all ranks."""

@@ -179,9 +179,8 @@ def friction_values(
 ) -> Array:
     """Bounds or coefficients of conditions along tangents, ``(n, gdim - 1)``, 0 without a law.
 
-    Collective.
     Raise an InputError where a value is negative or no number somewhere, or a function on another
-    mesh; the message begins with the contact's name.
+    mesh; the message begins with the contact's name. Collective.
     """
     if friction is None:
         return np.zeros((len(records), dofs.bs - 1))

@@ -13,14 +13,7 @@ from scipy.linalg import qr
 from scipy.sparse import csc_array, csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import (
-    Array,
-    Entries,
-    beside,
-    entries_at,
-    entries_within,
-    sum_rows,
-)
+from tfeti_dolfinx.common.arrays import Array, Entries, beside, entries_at, entries_within, sum_rows
 from tfeti_dolfinx.common.parallel import bcast_from_root, rows_over
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 

@@ -41,10 +41,9 @@ def write_vtx(
     """Write all fields of a solution for ParaView. Collective.
 
     Nodal fields (displacement, pressure, gap, status, with mass velocity, with contacts traction,
-    with friction tangential traction and slip, with a stress
-    stress and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
-    material, and the discretisation error if it has been estimated) to a second file,
-    ``<stem>_cells.bp``.
+    with friction tangential traction and slip, with a stress stress and von Mises stress averaged
+    at the nodes) go to ``path``; cell fields (subdomain, body, material, and the discretisation
+    error if it has been estimated) to a second file, ``<stem>_cells.bp``.
 
     Args:
         path: A name that ends with ``.bp``. Where DOLFINx has no ADIOS2, XDMF files with the

@@ -64,13 +64,6 @@ def beside(kind: FacetKind, facets: Facets, rows: Array, xi: Array) -> Array:
     return height[:, None] * facets.normal[rows]
 
 
-def _monomials(t: Array) -> Array:
-    """½ tᵀKt = Σ_k m_k(t) K_k, K_k the entries of K on and above the diagonal."""
-    pairs = combinations_with_replacement(range(t.shape[-1]), 2)
-    terms = [(0.5 if i == j else 1.0) * t[..., i] * t[..., j] for i, j in pairs]
-    return np.stack(terms, axis=-1)
-
-
 def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Array]:
     """Return matrices and right sides of the least squares for a and K at each vertex, a first.
 
@@ -84,7 +77,10 @@ def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Arr
     u = t / np.where(flat > 0.0, flat, np.inf)[..., None]
     other = length > 0.0
     inverse = np.divide(1.0, length, out=np.zeros_like(length), where=other)
-    rows = np.concatenate((u * inverse[..., None], _monomials(u)), axis=3)
+    # ½ uᵀKu = Σ_k m_k(u) K_k, K_k the entries of K on and above the diagonal
+    pairs = combinations_with_replacement(range(u.shape[-1]), 2)
+    terms = [(0.5 if i == j else 1.0) * u[..., i] * u[..., j] for i, j in pairs]
+    rows = np.concatenate((u * inverse[..., None], np.stack(terms, axis=-1)), axis=3)
     height = np.einsum("nvwg,nvg->nvw", d, normals) * inverse**2
     return rows.swapaxes(2, 3) @ rows, np.einsum("nvwi,nvw->nvi", rows, height)
 

@@ -17,12 +17,7 @@ from tfeti_dolfinx.common.validation import checked_callable, checked_flag, chec
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
-from tfeti_dolfinx.errors import (
-    ConvergenceError,
-    InputError,
-    TfetiError,
-    raised_on_all_ranks,
-)
+from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms

@@ -234,11 +234,7 @@ class Homogenised:
     rounding: float  # what rounding leaves of b₀ where it should be 0
 
 
-def homogenise(
-    qp: QP,
-    at: OperatorProduct | None = None,
-    warm: bool = False,
-) -> Homogenised:
+def homogenise(qp: QP, at: OperatorProduct | None = None, warm: bool = False) -> Homogenised:
     """Homogenise a quadratic program. Collective.
 
     Args:

@@ -363,6 +363,8 @@ class Ellipses:
     def _nearest(self, z: Array, which: Array) -> Array:
         """Return the nearest points of the boundary: a_j²z_j/(a_j² + μ)."""
         a = self.semi_axes[which]
+        if np.all(a == a[:, :1]):  # discs and intervals
+            return np.asarray(a * (z / np.linalg.norm(z, axis=1, keepdims=True)))
         scale = np.maximum(a.max(axis=1, initial=TINY), TINY)[:, None]
         a, z = a / scale, z / scale
         y = a * a * z / np.maximum(a * a + _secular(a, z)[:, None], TINY)

@@ -41,11 +41,7 @@ SOLVERS = {
         warm=lambda qp, start: qp.coarse.project(start.lam) + qp.coarse.particular(),
     ),
     "smalse": Solver(
-        smalse,
-        SmalseParameters(),
-        keeps_sets=True,
-        pc_type="none",
-        relative_to_norm=True,
+        smalse, SmalseParameters(), keeps_sets=True, pc_type="none", relative_to_norm=True
     ),
     "newton": Solver(
         newton,

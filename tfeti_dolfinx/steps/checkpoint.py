@@ -81,11 +81,10 @@ class Checkpoint:
 
     Each rank writes its arrays to a file of its own, with the number of the step in its name,
     subdomain by subdomain. Another number of ranks reads them: each rank the files that have its
-    subdomains.
-    The record of the step is a line at the end of ``records.jsonl``, with the checksums of its
-    fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of states:
-    it is written aside and renamed, so it names whole files at any time, and a line that is torn
-    lies beyond the lines of so many steps. Then the state of the step before goes. What a step
+    subdomains. The record of the step is a line at the end of ``records.jsonl``, with the checksums
+    of its fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of
+    states: it is written aside and renamed, so it names whole files at any time, and a line that is
+    torn lies beyond the lines of so many steps. Then the state of the step before goes. What a step
     writes does not grow with their number.
 
     The folder is the checkpoint's own. ``checkpoint.json`` marks it before anything else is

@@ -62,6 +62,9 @@ class KernelTolerances:
     # is as good as 0 on the trace: K_ii resists it by the square of that, which a Cholesky factor
     # loses
     on_trace: float = 1e-6
+    # of (K⁺)_bb with a diagonal of ones, the inverse of its condition: below it the inverse, S, has
+    # lost more than half of the digits
+    invertible: float = 1e-8
 
 
 TOLERANCES = KernelTolerances()
@@ -110,8 +113,10 @@ def kernel_of(K: Any, modes: Array) -> Array:
     # other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
     largest = np.maximum.reduceat(K.diagonal()[K.indices], K.indptr[:-1])
     sizes = np.sqrt(largest)[:, None] * np.abs(R)
-    pattern = LocalMatrix(Entries(np.ones(len(K.data)), K.indices, K.indptr, K.shape))
-    terms = np.sum(sizes * (pattern @ sizes), axis=0)
+    terms = np.sum(sizes**2, axis=0)  # those of the diagonal, which are often enough
+    if np.any(energy > TOLERANCES.null * terms):
+        pattern = LocalMatrix(Entries(np.ones(len(K.data)), K.indices, K.indptr, K.shape))
+        terms = np.sum(sizes * (pattern @ sizes), axis=0)
     return np.asarray(R[:, energy <= TOLERANCES.null * terms])
 
 
@@ -132,9 +137,11 @@ def fixing_nodes(x: Array, count: int) -> Array:
 
 def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
     """Return positions of the unknowns at well-spread nodes, given the node of each unknown."""
-    nodes = np.unique(node_of_dof)
-    chosen = nodes[fixing_nodes(x[nodes], 2 ** x.shape[1])]
-    return np.flatnonzero(np.isin(node_of_dof, chosen))
+    asked, chosen = np.zeros((2, len(x)), dtype=bool)
+    asked[node_of_dof] = True
+    nodes = np.flatnonzero(asked)
+    chosen[nodes[fixing_nodes(x[nodes], 2 ** x.shape[1])]] = True
+    return np.flatnonzero(chosen[node_of_dof])
 
 
 # --- The Block --------------------------------------------------------------------------------

@@ -20,10 +20,11 @@ log = logging.getLogger(__name__)
 
 # in the order of preference
 SOLVERS = ("cholmod", "mumps", "petsc")
-# without these an indefinite matrix would pass: CHOLMOD's simplicial LDLᵀ takes pivots of any
-# sign, and MUMPS tells their signs only if it also looks for pivots that are zero
+# without these an indefinite matrix would pass: CHOLMOD's LDLᵀ takes pivots of any sign, unlike
+# LLᵀ, and MUMPS tells their signs only if it also looks for pivots that are zero
 DEFINITE = {
-    "mat_cholmod_factor": "SUPERNODAL",
+    "mat_cholmod_final_asis": "0",
+    "mat_cholmod_final_ll": "1",
     "mat_mumps_icntl_13": "1",
     "mat_mumps_icntl_24": "1",
 }

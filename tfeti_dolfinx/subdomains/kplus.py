@@ -135,10 +135,10 @@ def gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool
 
 def _with_weakly_held(K: Any, R: Array, x: Array) -> Array:
     """Return an orthonormal basis of the kernel and of rigid motions that weak springs hold."""
-    centre, length = x.mean(axis=0), float(np.linalg.norm(np.ptp(x, axis=0)))
-    modes = candidate_modes(x, K.shape[0] // len(x), centre, length)
-    if R.shape[1] == modes.shape[1]:
+    bs = K.shape[0] // len(x)
+    if R.shape[1] == candidate_modes(x[:1], bs, x[0], 1.0).shape[1]:
         return R
+    modes = candidate_modes(x, bs, x.mean(axis=0), float(np.linalg.norm(np.ptp(x, axis=0))))
     U, s, _ = np.linalg.svd(_beside(R, modes), full_matrices=False)
     U = U[:, s > TOLERANCES.still * np.linalg.norm(modes, axis=0).max()]
     energies, turn = np.linalg.eigh(U.T @ (K @ U))

@@ -13,7 +13,7 @@ from scipy.linalg.blas import dsymm, dsymv
 
 from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
-from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock, Stiffness
 
 # --- Choice of their form ----------------------------------------------------------------------
 
@@ -43,17 +43,19 @@ class Group:
     size: int  # rows of A
     columns: int  # vectors that A is applied to at once
     place: Array  # where the trace unknowns go in these columns, the first column first
-    where: Array  # where they lie among those of the rank
+    where: Array | slice  # their places among the rank's; a slice: one column, as it stands
     apply: Callable[[Array], Array]  # a W, shapes (size,) or (size, q)
     work: float  # operations of `apply` for a vector, 0 if they are not known
     can_be_dense: bool = True  # whether there is use in a dense A
     dense: Array | None = None  # a, where that is cheaper
+    stiffness: Stiffness | None = None  # of a K⁺: on what trace this is known makes S dense, too
+    trace: Array | None = None  # this trace, ascending
 
     def prefers_dense(self, choice: LocalChoice) -> bool:
         """Return whether the group takes a dense matrix: by its type, or for fewer operations.
 
         It costs as many solves as it has columns. A single right side reads the factor for itself,
-        as long as three of many take.
+        as long as three of many take; with a dense K⁺ of one Block comes S, as often multiplied by.
         """
         if choice.type in ("implicit", "explicit") or not self.can_be_dense:
             return self.can_be_dense and choice.type == "explicit"
@@ -61,17 +63,19 @@ class Group:
             return False
         once = self.work * (3.0 if self.columns == 1 else self.columns)
         dense = 2.0 * self.size**2 * self.columns
-        return choice.multiplications * (once - dense) > self.work * self.size
+        times = choice.multiplications * (2 if self.stiffness and self.columns == 1 else 1)
+        return times * (once - dense) > self.work * self.size
 
     def mult(self, w: Array, out: Array) -> None:
         """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
+        if isinstance(self.where, slice):
+            own = w[self.where]
+            out[self.where] = self.apply(own) if self.dense is None else dsymv(1.0, self.dense, own)
+            return
         flat = np.zeros(self.size * self.columns)
         flat[self.place] = w[self.where]
-        if self.columns == 1:
-            product = self.apply(flat) if self.dense is None else dsymv(1.0, self.dense, flat)
-        else:
-            columns = flat.reshape((self.size, self.columns), order="F")
-            product = self.apply(columns) if self.dense is None else dsymm(1.0, self.dense, columns)
+        columns = flat.reshape((self.size, self.columns), order="F")
+        product = self.apply(columns) if self.dense is None else dsymm(1.0, self.dense, columns)
         out[self.where] = product.ravel(order="F")[self.place]
 
 
@@ -107,17 +111,21 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     rows = [np.searchsorted(trace, own) for own in traces]
     work = 4.0 * stiffness.entries
     chunks = apply if len(equal) <= TOGETHER else partial(_in_chunks, apply)
-    return _group(equal, rows, len(trace), chunks, work)
+    group = _group(equal, rows, len(trace), chunks, work)
+    return replace(group, stiffness=stiffness, trace=trace)
 
 
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
-    """S through the factor of K_ii."""
+    """S from a dense K⁺, or through the factor of K_ii."""
     traced = equal[0][0].traced
-    work = 2.0 * traced.stiffness.count
-    if traced.inner is not None:
-        work += 4.0 * (traced.coupling.count + traced.inner.entries)
     rows = [block.trace_rows for block, _ in equal]
-    return _group(equal, rows, len(traced.trace), traced.apply_schur, work)
+    group = _group(equal, rows, len(traced.trace), traced.apply_schur, 0.0)
+    if traced.schur is not None:
+        return replace(group, dense=traced.schur)
+    group.work = 2.0 * traced.stiffness.count
+    if traced.inner is not None:
+        group.work += 4.0 * (traced.coupling.count + traced.inner.entries)
+    return group
 
 
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
@@ -139,12 +147,7 @@ def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
 def _own_group(block: Block, kind: OperatorKind, part: slice) -> Group:
     """A Block of another class, one vector after the other."""
     apply, size = getattr(block, f"apply_{kind}"), len(block.trace_dofs)
-
-    def columns(W: Array) -> Array:
-        if W.ndim == 1:
-            return np.asarray(apply(W))
-        return np.stack([apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
-
+    columns = partial(np.apply_along_axis, lambda w: apply(np.ascontiguousarray(w)), 0)
     return _group([(block, part)], [np.arange(size)], size, columns, 0.0)
 
 
@@ -157,7 +160,10 @@ def _group(
 ) -> Group:
     """Return a group with these rows of its matrix in each column."""
     place = np.concatenate([k * size + row for k, row in enumerate(rows)])
-    where = np.concatenate([np.arange(part.start, part.stop) for _, part in blocks])
+    found = np.concatenate([np.r_[part] for _, part in blocks])
+    first, straight = int(found[0]), np.arange(size)
+    as_it_stands = np.array_equal(place, straight) and np.array_equal(found, first + straight)
+    where = slice(first, first + size) if as_it_stands else found
     return Group(len(blocks), size, len(rows), place, where, apply, work)
 
 
@@ -186,7 +192,8 @@ def solves_of(
             found.append((block.solve, dofs))
     for equal in members.values():
         solve = partial(_in_chunks, equal[0][0].stiffness.solve)
-        found.append((solve, np.stack([dofs for _, dofs in equal], axis=1)))
+        columns = [dofs for _, dofs in equal]
+        found.append((solve, np.stack(columns, axis=1) if len(columns) > 1 else columns[0]))
     return found
 
 
@@ -224,11 +231,13 @@ class GroupedOperator:
             block.prepare(self._kind)
         self._groups = groups_of(self._blocks, self._kind)
         for group in self._groups:
-            form = "implicit"
-            if group.prefers_dense(self._choice):
+            if group.dense is None and group.prefers_dense(self._choice):
                 A = _in_chunks(group.apply, np.eye(group.size, order="F"))
                 A += A.T  # symmetric to the last bit
-                group.dense, form = 0.5 * A, "explicit"
+                group.dense = 0.5 * A
+                if group.stiffness is not None:
+                    group.stiffness.pinv_on = group.trace, group.dense
+            form = "implicit" if group.dense is None else "explicit"
             self.forms["shared_" * (group.columns > 1) + form] += group.count
 
     def mult(self, w: Array, out: Array) -> None:

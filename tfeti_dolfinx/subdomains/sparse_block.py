@@ -11,6 +11,7 @@ from weakref import WeakSet, WeakValueDictionary
 
 import numpy as np
 from scipy.linalg import null_space
+from scipy.linalg.lapack import dpocon, dpotrf, dpotri
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix, entries_of_rows, entries_within
@@ -47,6 +48,7 @@ class Stiffness:
     Attributes:
         kernel: R, shape ``(n, r)``.
         diagonal: Diagonal of K.
+        pinv_on: A trace, ascending, on which a dense K⁺ is known, maybe empty, and this.
         entries: Entries of the factor; of an inverse that the user brings, as if it were dense.
     """
 
@@ -56,6 +58,7 @@ class Stiffness:
         self.size = int(K.shape[0])
         self.bs = self.size // max(len(x), 1)
         self._traced: WeakValueDictionary[bytes, Traced] = WeakValueDictionary()
+        self.pinv_on: Any = np.empty(0, dtype=np.int32), np.empty((0, 0))
         centre = x.mean(axis=0)
         length = np.linalg.norm(x - centre, axis=1).max()
         self.diagonal = K.diagonal()
@@ -106,8 +109,35 @@ class Traced:
         self._of, self.trace = stiffness, trace
         self.inside = np.setdiff1d(np.arange(stiffness.size), trace, assume_unique=True)
 
+    @cached_property
+    def schur(self) -> Array | None:
+        """S where a dense (K⁺)_bb is known and has an inverse that keeps its digits; else None.
+
+        (K_ρ⁻¹)_bb is S_ρ⁻¹, and S is S_ρ − W(R_bᵀW)⁻¹Wᵀ with W = S_ρR_b: K_ρ differs from K by as
+        many ranks as R has columns, and SR_b = 0.
+        """
+        R, (known, A) = self._of.kernel[self.trace], self._of.pinv_on
+        if not len(self.inside) or not len(self.trace) or not np.isin(self.trace, known).all():
+            return None
+        if not isinstance(self._of._pinv, CholeskyFactor):  # K_ρ⁻¹, unlike a K⁺ of one's own
+            return None
+        if R.size and np.linalg.svd(R, compute_uv=False)[-1] <= TOLERANCES.on_trace:
+            return None
+        rows = np.searchsorted(known, self.trace)
+        sizes = 1.0 / np.sqrt(A.diagonal()[rows])
+        A = sizes[:, None] * A[np.ix_(rows, rows)] * sizes
+        L, failed = dpotrf(A)
+        if failed or dpocon(L, np.linalg.norm(A, 1))[0] < TOLERANCES.invertible:
+            return None
+        S = sizes[:, None] * dpotri(L)[0] * sizes
+        S += np.triu(S, 1).T
+        W = S @ R
+        return np.asarray(S - W @ np.linalg.solve(R.T @ W, W.T))
+
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
+        if self.schur is not None:
+            return self.schur @ w
         Kw = self.stiffness @ w
         if self.inner is None:
             return Kw
@@ -306,7 +336,7 @@ class SparseBlock(Block):
         """Make K_bb for ``"stiffness"`` and factor K_ii for ``"schur"``."""
         if kind != "pinv":
             self.traced.stiffness  # noqa: B018
-        if kind == "schur":
+        if kind == "schur" and self.traced.schur is None:
             self.traced.inner, self.traced.coupling  # noqa: B018
 
     def retrace(self, trace_dofs: Array) -> None:
