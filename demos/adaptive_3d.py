@@ -196,7 +196,7 @@ if arguments.output:
 if arguments.plot:
     folder = arguments.output or Path("results")
     looks = {"view": (0.3, -1.0, -0.8), "focus": (0.0, 0.0, 0.0), "zoom": 4.0}
-    looks |= {"show": "pressure", "show_obstacles": False, "show_edges": True}
+    looks |= {"show": "pressure", "show_edges": True}
     tfeti.plot_deformed(folder / "adaptive_3d.png", problem.solution, **looks)
     tfeti.plot_pressure(
         folder / "adaptive_3d_pressure.png",

@@ -136,9 +136,9 @@ if arguments.output:
     tfeti.write_vtx(arguments.output / "hertz_3d.bp", problem.solution)
 if arguments.plot:
     folder = arguments.output or Path("results")
-    looks = {"view": (0.3, -1.0, -0.8), "focus": (0.0, 0.0, 0.0), "zoom": 8.0}
-    looks |= {"show_obstacles": False, "show_edges": True}
-    tfeti.plot_deformed(folder / "hertz_3d.png", problem.solution, show="pressure", **looks)
+    looks = {"view": (0.3, -1.0, -0.8), "focus": (0.0, 0.0, 0.0), "zoom": 6.0}
+    looks |= {"show": "pressure", "show_edges": True}
+    tfeti.plot_deformed(folder / "hertz_3d.png", problem.solution, **looks)
     tfeti.plot_pressure(
         folder / "hertz_3d_pressure.png",
         problem.solution,

@@ -106,7 +106,7 @@ if arguments.output:
     tfeti.write_vtx(arguments.output / "tresca_3d.bp", problem.solution)
 if arguments.plot:
     folder = arguments.output or Path("results")
-    looks = {"view": (-0.5, -1.0, -0.8), "show_obstacles": False}
+    looks = {"view": (-0.5, -1.0, -0.8)}
     tfeti.plot_deformed(folder / "tresca_3d.png", problem.solution, show="status", **looks)
 if arguments.report:
     problem.report.write(arguments.report, comm)

@@ -95,8 +95,8 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     plotter.subplot(0, 0)
     shade = {
         "lighting": not flat,
-        "ambient": 1.0 if flat else 0.55,  # colours are read, also where no light falls
-        "diffuse": 0.0 if flat else 0.45,
+        "ambient": 1.0 if flat else 0.85,  # colours are read, also where no light falls
+        "diffuse": 0.0 if flat else 0.2,
         "specular": 0.0,
     }
     edges = float(data["edges"])
@@ -151,7 +151,10 @@ def _coloured(
             plotter.add_mesh(part, color=colour, scalars=None, **shade)
     legend = [(text, colours[value]) for value, text in names.items() if np.any(of_cells == value)]
     if legend:
-        plotter.add_legend(legend, bcolor="white", border=True, size=(0.2, 0.05 * len(legend)))
+        plotter.subplot(0, 1)
+        size = (0.9, 0.045 * len(legend))
+        plotter.add_legend(legend, bcolor=None, face="rectangle", loc="center left", size=size)
+        plotter.subplot(0, 0)
     return None
 
 
@@ -172,7 +175,8 @@ def _add_obstacle(plotter: Any, box: Any, distance: Any, flat: bool) -> None:
     behind = 0.0 if flat else BEHIND * float(np.max(box[1] - box[0]))
     surface = image.contour([-behind], scalars="distance")
     if surface.n_cells:
-        line: dict[str, Any] = {"opacity": 0.4}
+        # seen from its inside, as a plane from below, it lies over what is drawn
+        line: dict[str, Any] = {"opacity": 0.15, "backface_params": {"opacity": 0.3}}
         if flat:
             line = {"line_width": 3, "lighting": False}
         plotter.add_mesh(surface, color=OBSTACLE, scalars=None, show_scalar_bar=False, **line)
