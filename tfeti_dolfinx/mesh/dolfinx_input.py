@@ -151,7 +151,8 @@ def _located(
             other = int(mesh.comm.allreduce(int(others.max(initial=NO_TAG)), op=MPI.MAX))
             known = next((k for k, t in names.items() if not callable(t) and t == other), other)
             raise InputError(
-                f"{what}[{name!r}]: the marker finds some that are {known!r}; expected each once"
+                f"{what}[{name!r}]: the marker finds some that are {known!r}; expected each once: "
+                "bodies that lie on each other are meshed a little apart, or come with tags"
             )
         tag += 1
         values[found], names[name] = tag, tag
