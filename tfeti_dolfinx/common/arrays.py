@@ -33,8 +33,7 @@ def sum_rows(row: Array, values: Array, size: int) -> Array:
 
 def parts_of(sizes: Sequence[int]) -> list[slice]:
     """Return the slices of arrays of these lengths in their concatenation."""
-    ends = np.cumsum([0, *sizes])
-    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+    return [slice(int(a), int(b)) for a, b in pairwise(np.cumsum([0, *sizes]))]
 
 
 def joined(parts: Sequence[Array]) -> Array:
@@ -100,6 +99,8 @@ def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
 
 def plus(A: Any, row: Array, column: Array, value: Array) -> Entries:
     """Return A plus these entries, in the order of rows and of columns, as those of a CSR A are."""
+    if not len(row):
+        return Entries(A.data, A.indices, A.indptr, A.shape)
     rows, which = np.unique(row, return_inverse=True)
     entries, begins = entries_of_rows(A, rows)
     own = np.repeat(np.arange(len(rows)), np.diff(begins)) * A.shape[1] + A.indices[entries]

@@ -300,8 +300,7 @@ class ContactState:
         """The v_i along normals, ``(n,)``, and tangents, ``(n, gdim - 1)``. Collective at first."""
         records = self.gluing.records
         v = relative_displacement(records, self.dofs, self.u)
-        along = np.einsum("ntg,ng->nt", records.tangents, v)
-        return np.sum(records.normal * v, axis=1), along
+        return np.sum(records.normal * v, axis=1), np.einsum("ntg,ng->nt", records.tangents, v)
 
     @cached_property
     def slip_of_conditions(self) -> Array:
@@ -310,8 +309,7 @@ class ContactState:
         Shape ``(n, gdim)``. Collective at first use.
         """
         records = self.gluing.records
-        slip = self._motion[1] - self.gluing.slip
-        return np.einsum("nt,ntg->ng", slip, records.tangents)
+        return np.einsum("nt,ntg->ng", self._motion[1] - self.gluing.slip, records.tangents)
 
     @cached_property
     def slip_at_end(self) -> Array:

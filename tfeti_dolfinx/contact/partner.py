@@ -254,8 +254,8 @@ class Obstacle(ContactPartner):
         given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
         n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
-        facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface))
         kind = facet_kind(dofs)
+        facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface), kind)
         centres, corners = facets.corners.mean(axis=1), facets.corners
         if dofs.bs > 1:  # of a scalar space the gradient's first component counts
             size = diameter(dofs.decomposition)
@@ -420,7 +420,7 @@ class Contact(ContactPartner):
             )
         sides, kind = [], facet_kind(dofs)
         for surface in self.surfaces:
-            facets = local_facets(dofs, surface_facets(dofs.decomposition, surface))
+            facets = local_facets(dofs, surface_facets(dofs.decomposition, surface), kind)
             whole = facets.radius ** (dofs.bs - 1)
             flat = int(np.sum(facets.area <= SEARCH.degenerate * whole))
             if count := dofs.comm.allreduce(flat):

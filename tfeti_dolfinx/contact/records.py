@@ -120,8 +120,7 @@ def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> 
 
 def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     """Return the v_i along the tangents of the frames, shape ``(n, gdim - 1)``. Collective."""
-    v = relative_displacement(records, dofs, u)
-    return np.einsum("ntg,ng->nt", records.tangents, v)
+    return np.einsum("ntg,ng->nt", records.tangents, relative_displacement(records, dofs, u))
 
 
 # --- Conditions from integrals ----------------------------------------------------------------

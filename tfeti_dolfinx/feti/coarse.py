@@ -105,8 +105,7 @@ class CoarseSpace(Coarse):
     def _load(self) -> Array:
         if not self.dimension:
             return np.zeros(0)
-        e = joined_over(self.comm, self.subdomains.kernel_load)
-        return self._basis.transposed(e)
+        return self._basis.transposed(joined_over(self.comm, self.subdomains.kernel_load))
 
     def _on_bodies(self, Gt: csr_array) -> BodyRows:
         """Return the rows of B R over their size on motions of bodies, without what is rounding."""

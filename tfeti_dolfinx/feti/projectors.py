@@ -107,8 +107,7 @@ def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
         return part
     own = np.repeat(np.arange(part.shape[0]), np.diff(part.indptr)), part.indices
     row, column = (joined_over(comm, index.astype(np.int64)) for index in own)
-    value = joined_over(comm, part.data)
-    return coo_array((value, (row, column)), shape=part.shape).tocsr()
+    return coo_array((joined_over(comm, part.data), (row, column)), shape=part.shape).tocsr()
 
 
 # --- Factors of the coarse problem ------------------------------------------------------------

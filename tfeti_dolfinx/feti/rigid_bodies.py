@@ -460,8 +460,7 @@ def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
     moving = np.flatnonzero(parts.max(axis=1) > TOLERANCES.takes_part * parts.max())
     share = parts[moving].max(axis=0)
     dominant = np.flatnonzero(share > TOLERANCES.dominant * share.max())
-    modes = " and ".join(mode_names[m] for m in dominant)
-    return moving, modes
+    return moving, " and ".join(mode_names[m] for m in dominant)
 
 
 def listed(

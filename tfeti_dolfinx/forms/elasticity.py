@@ -198,8 +198,7 @@ class Elasticity:
             degree = {"quadrature_degree": int(2 * slope + moduli + curved + ring)}
             dx = ufl.Measure("dx", domain=self.mesh, metadata=degree)
         checked_type(dx, ufl.Measure, "dx", "a measure of UFL, or None")
-        is_one = isinstance(self.thickness, float)
-        return work * dx if is_one else self.thickness * work * dx
+        return work * dx if isinstance(self.thickness, float) else self.thickness * work * dx
 
 
 def _checked_model(model: Any, gdim: int) -> str:

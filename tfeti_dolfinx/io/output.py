@@ -128,8 +128,7 @@ def write_pvd(
         InputError: The name does not end with ``.pvd``, or the files cannot be written there, as
             where the disk is full; then what was there before stays.
     """
-    target = checked_target(path, ".pvd", solution, interior)
-    return _one_step(target, solution, interior)
+    return _one_step(checked_target(path, ".pvd", solution, interior), solution, interior)
 
 
 def _one_step(target: Path, solution: Solution, interior: bool) -> list[Path]:

@@ -216,5 +216,4 @@ def _names(mesh: dmesh.Mesh, tags: dmesh.MeshTags | None, given: dict[str, int])
     """Return the names given, and for tags without a name their numbers."""
     local = set() if tags is None else set(np.unique(tags.values).tolist())
     present = set().union(*mesh.comm.allgather(local))
-    unnamed = sorted(present - set(given.values()))
-    return {**given, **{str(tag): tag for tag in unnamed}}
+    return {**given, **{str(tag): tag for tag in sorted(present - set(given.values()))}}

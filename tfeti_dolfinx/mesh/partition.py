@@ -153,5 +153,4 @@ def _checked_ids(ids: ArrayLike, num_cells: int, what: str) -> Array:
 
 def without_holes(ids: Array, comm: MPI.Intracomm) -> Array:
     """Renumber ids to 0, 1, ... in their order."""
-    used = np.unique(np.concatenate(comm.allgather(np.unique(ids))))
-    return np.searchsorted(used, ids)
+    return np.searchsorted(np.unique(np.concatenate(comm.allgather(np.unique(ids)))), ids)

@@ -152,9 +152,9 @@ def facet_nodes(dofs: TornDofs, facets: Array) -> Array:
     return dofs.primal_node[nodes]
 
 
-def local_facets(dofs: TornDofs, facets: Array) -> Facets:
+def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     """Data of local facets of the true boundary, without averaged normals."""
-    mesh, kind = dofs.V.mesh, facet_kind(dofs)
+    mesh = dofs.V.mesh
     gdim, (cell, place) = mesh.geometry.dim, _cells_at(mesh, facets)
     coordinate = mesh.ufl_domain().ufl_coordinate_element()
     of_cell = basix.create_element(

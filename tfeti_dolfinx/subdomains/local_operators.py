@@ -93,8 +93,7 @@ def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:
         alone = [equal[0] for equal in members.values() if len(equal) == 1]
         shared = [equal for equal in members.values() if len(equal) > 1]
         return [*groups, *map(_stiffness_group, [alone, *shared] if alone else shared)]
-    of_kind = _pinv_group if kind == "pinv" else _schur_group
-    return [*groups, *map(of_kind, members.values())]
+    return [*groups, *map(_pinv_group if kind == "pinv" else _schur_group, members.values())]
 
 
 def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
