@@ -8,6 +8,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from scenes import apart, clamp, decomposed, displacement, forms, problem, vectors
 from test_friction_fields import SCENES, floor, solved
+from test_nearly_free import rings
 
 import tfeti_dolfinx as tfeti
 
@@ -122,39 +123,46 @@ def test_the_body_that_slides_without_end_is_named():
     parts = [("still", (0.0, 0.0), (1.0, 1.0), (3, 3)), ("loose", (2.0, 0.0), (3.0, 1.0), (3, 3))]
     mesh, tags, names = boxes("quadrilateral", parts)
     d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
-    planes = {
-        "still bottom": tfeti.Plane((0, 0), (0, 1)),
-        "loose left": tfeti.Plane((2, 0), (1, 0)),
-        "loose right": tfeti.Plane((3, 0), (-1, 0)),
-    }
-    p = two_body_problem(
-        d,
-        lambda v, ds: -0.05 * v[1] * (ds(d.surface("still top")) + ds(d.surface("loose top"))),
-        lambda V: [],
-        [
-            tfeti.Obstacle(side, plane, friction=tfeti.Coulomb(0.5), reach=np.inf)
-            for side, plane in planes.items()
-        ],
-    )
-    loose = d.body_names[body_of(d, "loose left")]
-    said = f"DIVERGED_FRICTION .* body '{loose}' slides without end: .* gaps that overlap"
-    with pytest.raises(tfeti.ConvergenceError, match=said):
+    planes = {"still bottom": ((0, 0), (0, 1)), "loose left": ((2, 0), (1, 0))}
+    planes["loose right"], law = ((3, 0), (-1, 0)), tfeti.Coulomb(0.5)
+    contacts = [
+        tfeti.Obstacle(side, tfeti.Plane(*plane), friction=law, reach=np.inf)
+        for side, plane in planes.items()
+    ]
+    tops = d.surface("still top"), d.surface("loose top")
+    p = two_body_problem(d, lambda v, ds: -0.05 * v[1] * ds(tops), lambda V: [], contacts)
+    said = r"body \d is free to move \(translation in y\) without end on contact 1: .* 2: .* gap"
+    with pytest.raises(tfeti.ConvergenceError, match=f"DIVERGED_FRICTION .* {said}"):
         p.solve()
 
 
-def body_of(d, surface):
-    """The body that a surface is of."""
-    facets, comm = d.facets(surface), d.comm
-    d.mesh.topology.create_connectivity(1, 2)
-    cells = [d.mesh.topology.connectivity(1, 2).links(f)[0] for f in facets]
-    found = d.body_of_subdomain[d.cell_subdomain[cells]] if cells else np.array([-1])
-    return comm.allreduce(int(found.max()), op=MPI.MAX)
+def test_a_ring_is_turned_in_its_fit_as_far_as_friction_holds(comm):
+    """Above that it would wedge at 180 radians, as nodes are spaced unevenly by 1e-4."""
+    d = rings([((0, 0), r, r + 0.5, 2, 24, 1e-4, seed) for r, seed in ((0.5, 1), (1.0, 2))], 3)
+    twist, (x, y) = fem.Constant(d.mesh, 1e-3), ufl.SpatialCoordinate(d.mesh)
+    p = two_body_problem(
+        d,
+        lambda v, ds: twist * (x * v[1] - y * v[0]) * ds(d.surface("in0")),
+        lambda V: [clamp(V, d.facets("out1"))],
+        [tfeti.Contact("out0", "in1", gap=-0.01, friction=tfeti.Coulomb(0.2), name="fit")],
+    )
+    p.solve()
+    fit = p.solution.contact("fit")
+    pressed, turned = comm.allreduce(fit.force.sum()), abs(fit.resultant.moment[2])
+    twist.value *= 0.97 * 0.2 * np.cos(np.pi / 24) * pressed / turned
+    p.solve()
+    assert np.abs(p.u.x.array).max(initial=0.0) < 0.01
+    twist.value *= 1.05 / 0.97
+    with pytest.raises(tfeti.ConvergenceError, match=r"in the plane\) without end on .*: fit, "):
+        p.solve()
+    p.update(values=[])
+    with pytest.raises(tfeti.NoSolutionError, match=r"rotation in the plane\): nothing resists"):
+        p.solve()
 
 
 def test_what_sticks_where_a_wall_pushes_slips():
     """Sticking to the floor contradicts a wall that overlaps it by 0.01: bounds hold neither."""
-    d = decomposed("quadrilateral", 4, 3)
-    law = tfeti.Coulomb(0.3)
+    d, law = decomposed("quadrilateral", 4, 3), tfeti.Coulomb(0.3)
     wall = tfeti.Obstacle("left", tfeti.Plane((0.01, 0), (1, 0)), friction=law)
     p = problem(d, (0.0, -0.05), [floor(2, law), wall], clamped=(), rtol=1e-8)
     p.solve()

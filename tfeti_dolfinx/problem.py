@@ -38,7 +38,6 @@ from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checke
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
-from tfeti_dolfinx.qp.problem import ConvergedReason
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.report import Outcome, Report, SolverCounts, added, largest_over_ranks
 from tfeti_dolfinx.saved_state import SavedState, check_state
@@ -307,9 +306,8 @@ class ContactProblem:
         # 3. what the report says of it
         counts = SolverCounts.of_run(dual, *solved)
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
-        excluding = list[str]()
-        if result.reason == ConvergedReason.DIVERGED_CONTRADICTION:
-            excluding = system.search.named(gluing.contacts_of(result.excluding))
+        contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
+        excluding = system.search.named(contacts)
         state, loose = accuracy.recovered, list[dict[str, Any]]()
         if options.warnings and state is not None:
             loose = dual.nearly_free(state.active)
@@ -320,8 +318,8 @@ class ContactProblem:
             warnings = self._diagnostics.found(dual, solution, outcome, options.number)
         method, notes = f"{options.qp_type} + {options.pc_type}", notes_of(outcome, solution)
         self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
-        restless = [*d.body_names, *system.tools.free_names][settling.body], settling.slides
-        conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
+        restless = [*d.body_names, *system.tools.free_names][settling.body]
+        conclude(result, accuracy, now, d.comm, excluding, restless, settling.slides, warnings)
         return solution, accuracy.tolerances().jump
 
     def _log_warnings(self) -> None:

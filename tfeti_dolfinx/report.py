@@ -212,7 +212,7 @@ class Outcome:
     nearly_free: list[dict[str, Any]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # why the answer cannot be trusted
     notes: list[str] = field(default_factory=list)  # what is worth knowing, and needs no change
-    excluding_contacts: list[str] = field(default_factory=list)  # whose rows exclude each other
+    excluding_contacts: list[str] = field(default_factory=list)  # that exclude each other, or slip
     active_contacts: int = 0  # rows with a positive force
     sticking: int = 0  # nodes with friction that touch and stick
     sliding: int = 0  # those that slip

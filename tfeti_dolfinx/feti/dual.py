@@ -25,7 +25,7 @@ from tfeti_dolfinx.feti.operator import (
     scaled_rows,
 )
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
-from tfeti_dolfinx.feti.rigid_bodies import listed
+from tfeti_dolfinx.feti.rigid_bodies import free_to_move, listed
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, LastProduct, Operator
@@ -359,6 +359,13 @@ class Dual:
             found = bcast_from_root(comm, listed(motions, self.coarse.bodies, *self._names))
             known = self._nearly_free = (active, found)
         return known[1]
+
+    def sliding(self, motion: Array) -> tuple[str, Array]:
+        """Return a sentence on a motion of bodies, and local rows of friction that slip most."""
+        coarse, slip = self.coarse, np.zeros(len(self.d))
+        slip[coarse.rubbing] = np.abs(coarse.J @ motion)[coarse.rubbing]
+        most = np.flatnonzero(slip > 0.5 * largest(coarse.comm, slip))
+        return free_to_move(coarse.bodies.amounts(motion), *self._names), most
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

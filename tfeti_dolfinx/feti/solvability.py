@@ -203,23 +203,21 @@ def check_solvable(
         with raised_on_all_ranks(coarse.comm):
             if scene is not None:
                 found = _explained(scene, coarse, constraints.sets.tangents.shape[1])
-        found = bcast_from_root(coarse.comm, found)
-        if found is not None:
-            motion, reason = found
+        motion, reason = bcast_from_root(coarse.comm, found) or (None, reason)
     if motion is not None:
         words = free_to_move(coarse.bodies.amounts(motion), body_names, mode_names)
         raise NoSolutionError(f"{words}: {reason}")
 
 
-def sliding_body(coarse: CoarseSpace, constraints: Constraints, pulling: Array) -> int:
-    """Return a body that the load moves; -1: forces within the limits hold it. Collective."""
+def sliding_motion(coarse: CoarseSpace, constraints: Constraints, pulling: Array) -> Array | None:
+    """Return how the load moves bodies; None: forces within the limits hold them. Collective."""
     if not coarse.unheld.free.any():
-        return -1
-    scene, body = rigid_scene(coarse, constraints, pulling, cones=False), -1
+        return None
+    scene, motion = rigid_scene(coarse, constraints, pulling, cones=False), None
     with raised_on_all_ranks(coarse.comm):
         if scene is not None and (y := scene.escape()) is not None:
-            body = int(scene.body[np.argmax(np.abs(y))])
-    return bcast_from_root(coarse.comm, body)
+            motion = coarse.unheld.alone @ y
+    return bcast_from_root(coarse.comm, motion)
 
 
 def rigid_scene(
@@ -251,15 +249,9 @@ def rigid_scene(
     axes = [[vstack(axis, format="csr") for axis in zip(*of, strict=True)] for of in tangential]
     # nothing where no rank has rows
     of_cones, of_given = (tuple(of) if of and of[0].shape[0] else () for of in axes)
-    return RigidScene(
-        Z.T @ (coarse.work(coarse.e)),
-        bodies.negligible[body],
-        body,
-        vstack(normals, format="csr"),
-        vstack(pressing, format="csr"),
-        of_cones,
-        of_given,
-    )
+    N, P = (vstack(rows, format="csr") for rows in (normals, pressing))
+    load, noise = Z.T @ coarse.work(coarse.e), bodies.negligible[body]
+    return RigidScene(load, noise, body, N, P, of_cones, of_given)
 
 
 def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
@@ -273,7 +265,11 @@ def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
     Q = orthonormal_columns(free.joint)
     joint = np.asarray(Q @ (Q.T @ load))
     each = np.linalg.norm(joint.reshape(bodies.count, bodies.k), axis=1)
-    return joint if joint @ load > bodies.negligible @ each else None
+    if not joint @ load > bodies.negligible @ each:
+        return None
+    # a turn that facets hold a little is a small part of a free motion, but does the work
+    work = joint * np.abs(load)
+    return np.asarray(joint / np.abs(joint).max() + work / np.abs(work).max())
 
 
 def _explained(

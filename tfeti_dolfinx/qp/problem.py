@@ -137,7 +137,7 @@ class QPResult:
     reference: float  # b₀ = ‖P(d − F λ̄₀)‖
     norm: float  # estimate of ‖F‖ that ‖Q x‖ is weighted with; 0 where nothing has shown it
     steps: Steps = field(default_factory=Steps)  # steps taken
-    # local rows that exclude each other, if that is why the solver stopped
+    # local rows that exclude each other, or slip, if that is why the solver stopped
     excluding: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.logging import cite
-from tfeti_dolfinx.common.parallel import any_rank, norm_over, steering, summed
+from tfeti_dolfinx.common.parallel import any_rank, largest, norm_over, steering, summed
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.solvability import sliding_body
+from tfeti_dolfinx.feti.solvability import sliding_motion
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget, MakeRule
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.friction_newton import (
@@ -60,6 +60,9 @@ class CoulombParameters:
     # most steps of a problem with the bounds of the law, which begins at its answer: bounds that
     # are rounding leave a body to be turned by rounding
     confirming: int = 100
+    # of what bends, of gaps and of what is prescribed: a slip without end. It is below 10 where
+    # friction holds, below 1e3 where it holds 1e-6 more than the load, 1e4 and more where it fails
+    slips: float = 1e4
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,9 @@ class FixedPointStatus:
     iterations: int = 0  # problems with given bounds that were solved; 0 without Coulomb's law
     change: float = 0.0  # last change of the bounds, over their size
     tolerance: float = 0.0  # what that had to come down to
-    # the body on which they changed most at last, or that slides; -1 without Coulomb's law
-    body: int = -1
+    body: int = -1  # that on which they changed most at last; -1 without Coulomb's law
     newton_steps: int = 0  # steps of Newton's method on Coulomb's law, beside the problems
-    slides: bool = False  # whether no bounds were found that hold a body
+    slides: str = ""  # what friction does not hold, in words
 
 
 def solve_with_friction(
@@ -95,7 +97,8 @@ def solve_with_friction(
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
         dual.bound_friction(None)  # there may have been coefficients
         solved = solve_dual(dual, options, qp_type, start, monitor, goal, make_rule)
-        return *solved, FixedPointStatus()
+        slides = _slides(dual, *solved, None, parameters.slips)
+        return *solved, FixedPointStatus(slides=slides)
     least = options.number if goal is None else parameters.with_target * options.friction_rtol
     tolerance = min(options.friction_rtol, parameters.beside_rtol * least)
     bounds = FrictionBounds(dual, start, parameters)
@@ -103,7 +106,7 @@ def solve_with_friction(
     rtol, change, aim, near = parameters.first, np.inf, np.inf, False
     steps, looks, iterations = Steps(), 0, 0
     law = newton.solve(start, bounds)
-    holds = law is not None or bounds.hold()
+    motion = None if law else bounds.hold()
     while True:
         # Step 1: the problem with these bounds; those of the law are worth all digits
         if law is None:
@@ -116,22 +119,18 @@ def solve_with_friction(
             dual, limited, qp_type, law or start, monitor, exact, make_rule, rtol=asked
         )
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
+        reached = parameters.looser * rule.tolerance
         if result.reason <= 0:
             if law is None and not bounds.turn(result.reason):
                 break
-            law = law and newton.go_on(
-                law, bounds, result.reason, parameters.looser * rule.tolerance
-            )
-            holds = law is not None or bounds.hold()
-            if not holds:
-                result.reason = ConvergedReason.DIVERGED_FRICTION
+            law = law and newton.go_on(law, bounds, result.reason, reached)
+            if not law and (motion := bounds.hold()) is not None:
                 break
             continue
         # Step 2: its forces of normals, beside those that the bounds are of
         change = bounds.change(result.lam)
         near = change <= parameters.near * tolerance
-        # residuals and errors fall together
-        aim = parameters.looser * rule.tolerance * min(1.0, least / asked)
+        aim = reached * min(1.0, least / asked)  # residuals and errors fall together
         # Step 3: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
             if goal is not None or bounds.fit(result, rule):
@@ -146,15 +145,33 @@ def solve_with_friction(
         start = law or (result.lam, result.mu)
         bounds.advance()
         law = newton.solve(start, bounds, aim) if moved else None
-        holds = law is not None or bounds.hold()
-        if not holds or bounds.idle > parameters.patience or iterations >= options.friction_max_it:
+        motion, idle = None if law else bounds.hold(), bounds.idle > parameters.patience
+        if motion is not None or idle or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
     result.steps, rule.looks = steps, looks
-    status = FixedPointStatus(
-        iterations, float(change), tolerance, bounds.body, newton.steps, slides=not holds
-    )
+    slides = _slides(dual, result, rule, motion, parameters.slips)
+    status = FixedPointStatus(iterations, change, tolerance, bounds.body, newton.steps, slides)
     return result, rule, status
+
+
+def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, most: float) -> str:
+    """Say that a motion of bodies, else that of u, has no end; "" if it has one. Collective.
+
+    Then the result is no answer, and has the rows that slip most. Where friction fails a body may
+    yet wedge in rounding, or in straight facets, far away.
+    """
+    state, coarse = rule.recovered, dual.coarse
+    known = motion is not None or result.reason == ConvergedReason.DIVERGED_CONTRADICTION
+    if not known and state is not None and dual.contact_rows[1] and coarse.dimension:
+        slip, bends = (np.abs(x) / coarse.row_size for x in (state.gap, state.residual))
+        if largest(coarse.comm, slip[coarse.rubbing]) > most * largest(coarse.comm, bends):
+            motion = coarse.bodies.part_of(state.u)
+    if motion is None:
+        return ""
+    result.reason = ConvergedReason.DIVERGED_FRICTION
+    words, result.excluding = dual.sliding(motion)
+    return words
 
 
 # --- Bounds of friction -----------------------------------------------------------------------
@@ -168,7 +185,7 @@ class FrictionBounds:
 
     Attributes:
         now: The present ones, of each of ``constraints.pressed``; ∞: the point sticks.
-        body: The body on which they changed most at last, or that they do not hold; -1 before.
+        body: The body on which they changed most at last; -1 before.
         before: Those before the last try of others.
         idle: Problems in a row whose change is not half of the least one before.
     """
@@ -198,21 +215,16 @@ class FrictionBounds:
         """True if some bounds are not set yet, so that their points stick."""
         return any_rank(self._comm, np.isinf(self.now))
 
-    def hold(self) -> bool:
-        """Set the present bounds, else let all stick, once; return whether that holds the load."""
-        self._dual.bound_friction(self.now)
-        if self.stick:
-            return True
+    def hold(self) -> Array | None:
+        """Set the present bounds, else let all stick, once; return a motion that they let go."""
         dual = self._dual
-        sliding = sliding_body(dual.coarse, dual.constraints, dual.pulling)
-        if sliding < 0:
-            return True
-        self.body = sliding
-        if self._stuck:
-            return False
+        dual.bound_friction(self.now)
+        motion = None if self.stick else sliding_motion(dual.coarse, dual.constraints, dual.pulling)
+        if motion is None or self._stuck:
+            return motion
         self.now, self._stuck = np.full(len(self._rows), np.inf), True
-        self._dual.bound_friction(self.now)
-        return True
+        dual.bound_friction(self.now)
+        return None
 
     def turn(self, reason: ConvergedReason) -> bool:
         """Let all slip where sticking contradicts itself, as beside a wall that pushes, once.
@@ -220,8 +232,7 @@ class FrictionBounds:
         Or stick, where no forces within the bounds of an earlier step are found to balance a load,
         as of one that was far smaller. Return whether there are other bounds.
         """
-        contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
-        if contradicts and not self._slipped:
+        if self.stick and not self._slipped and reason == ConvergedReason.DIVERGED_CONTRADICTION:
             self.now, self._slipped = np.zeros(len(self._rows)), True
             return True
         if reason != ConvergedReason.DIVERGED_STALLED or self._stuck:
@@ -243,9 +254,7 @@ class FrictionBounds:
         if self.stick:
             return float("inf")
         nothing = np.full(len(self._rows), self._none)
-        miss, size, least = (
-            self._on_bodies(x) for x in (self._found - self.now, self._found, nothing)
-        )
+        miss, size, least = map(self._on_bodies, (self._found - self.now, self._found, nothing))
         lightest = parameters.light * size.max(initial=0.0)
         size = np.maximum(size, max(least.max(initial=TINY), lightest))
         self.body = int(np.argmax(miss / size))
@@ -362,13 +371,9 @@ class NewtonOnLaw:
             return None
         cite("newton on friction")
         dual.learn()  # steps differ by few rows, if by any
-        qp, at = dual.qp(), dual.constraints.pressed
-        rows = dual.constraints
-        law = Law(
-            lambda pressures: dual.law(rows.with_pressures(pressures)),
-            rows.pressed_by[at],
-            rows.sets.tangents[at],
-        )
+        qp, rows, at = dual.qp(), dual.constraints, dual.constraints.pressed
+        normals, tangents = rows.pressed_by[at], rows.sets.tangents[at]
+        law = Law(lambda known: dual.law(rows.with_pressures(known)), normals, tangents)
         program = LawProgram(qp, law, dual.coarse.oblique, norm)
         # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
         Fx = dual.last.image(qp.F, qp.coarse.comm, start[0]).Fx

@@ -45,9 +45,9 @@ EXPLANATIONS = {
 }
 # in the place of that of DIVERGED_FRICTION
 SLIDES = (
-    "; the body {restless!r} slides without end: forces within Coulomb's law could balance the "
-    "load, but contact does not press as much as they need: expected a body that is held, or "
-    "pressed by a load or by gaps that overlap"
+    "; {slides} without end{contacts}, where contact does not press as much as friction needs to "
+    "balance the load: expected a smaller load, or a body that is held, or pressed by another load "
+    "or by gaps that overlap"
 )
 
 
@@ -109,8 +109,8 @@ def solve_dual(
     begin = _start(start, qp)
     homogenised = _homogenise(dual, qp, solver, begin)
     # of a set of one's own solvability knows which rows pull, not how much they bear
-    own = dual.law is not contact_set and solver.cold is not None
-    if own and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
+    given = dual.law is not contact_set and solver.cold is not None
+    if given and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
         raise NoSolutionError(
             "extensions: feasible_set has no forces that balance the load; expected a set that "
             "bears it, or a Dirichlet condition or a spring besides"
@@ -121,15 +121,9 @@ def solve_dual(
     scale = homogenised.reference, homogenised.rounding
     rule = make_rule(dual, rtol, options.atol, scale, qp.norm)
     rule.goal, rule.waits = goal, goal is not None  # assessments against a target are costly
-    parameters = getattr(options, qp_type, solver.parameters)
+    own, most = getattr(options, qp_type, solver.parameters), options.max_it
     result = solver.solve(
-        qp,
-        homogenised,
-        rule,
-        parameters,
-        max_it=options.max_it,
-        start=begin,
-        monitor=monitor or no_monitor,
+        qp, homogenised, rule, own, max_it=most, start=begin, monitor=monitor or no_monitor
     )
     rounding = result.reason == ConvergedReason.DIVERGED_ROUNDING
     if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
@@ -177,23 +171,23 @@ def conclude(
     options: Options,
     comm: MPI.Intracomm,
     excluding: Sequence[str] = (),
-    restless: tuple[str, bool] = ("", False),
+    restless: str = "",
+    slides: str = "",
     warnings: Sequence[str] = (),
 ) -> None:
     """Say why the solver stopped, and raise where it should have gone on.
 
-    ``excluding`` are names of the contacts whose rows exclude each other, ``restless`` is the body
-    on which bounds of friction change most, and whether it slides; an error says ``warnings``, too.
+    ``excluding`` are names of the contacts whose rows exclude each other, or slip; ``restless`` is
+    the body on which bounds of friction change most, ``slides`` says what friction does not hold;
+    an error says ``warnings``, too.
     Raise a ConvergenceError where it stopped before its tolerance, unless options turn that off.
     """
     if result.reason > 0 and not options.converged_reason:
         return
-    contacts = f", those of {' and '.join(excluding)}" if excluding else ""
-    body, slides = restless
-    explanation = EXPLANATIONS.get(result.reason, "")
-    if result.reason == ConvergedReason.DIVERGED_FRICTION and slides:
-        explanation = SLIDES
-    explanation = explanation.format(contacts=contacts, restless=body)
+    explanation = SLIDES if slides else EXPLANATIONS.get(result.reason, "")
+    of = " on contact" if slides else ", those of"
+    contacts = f"{of} {' and '.join(excluding)}" if excluding else ""
+    explanation = explanation.format(contacts=contacts, restless=restless, slides=slides)
     text = (
         f"{result.reason.name} after {result.steps.outer} outer and {result.steps.inner} inner "
         f"iterations: the worst of its errors is {rule.ratio():.3g} times what rtol "
