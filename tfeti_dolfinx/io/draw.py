@@ -19,13 +19,12 @@ import numpy as np
 # in a field of its own, right of the scene
 SCALAR_BAR = {
     "vertical": True,
-    "position_x": 0.1,
+    "position_x": 0.0,
     "position_y": 0.2,
     "height": 0.6,
     "width": 0.5,
     "color": "black",
-    "title_font_size": 26,
-    "label_font_size": 24,
+    "label_font_size": 32,
     "n_labels": 4,
     "fmt": "%.3g",
 }
@@ -121,11 +120,12 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     if actor is not None:
         unit = str(data["unit"])
         title = "\n".join([*name.split(), f"[{unit}]" * bool(unit), ""])
+        look = SCALAR_BAR | {"title_font_size": 32 if len(max(title.split(), key=len)) < 7 else 22}
         whole = {"fmt": "%.0f"} if 1e3 <= actor.mapper.scalar_range[1] < 1e5 else {}
-        plotter.add_scalar_bar(title=title, mapper=actor.mapper, **SCALAR_BAR | whole)
+        plotter.add_scalar_bar(title=title, mapper=actor.mapper, **look | whole)
     if factor != 1.0:
         text = f"displacement\n× {factor:.3g}"
-        plotter.add_text(text, position="lower_left", font_size=14, color="black")
+        plotter.add_text(text, position="lower_left", font_size=17, color="black")
     # lines are whole; "ssaa" would misplace the field of the scale
     plotter.enable_anti_aliasing("fxaa", all_renderers=True)
     plotter.screenshot(target)
