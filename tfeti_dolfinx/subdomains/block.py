@@ -62,9 +62,9 @@ class KernelTolerances:
     # is as good as 0 on the trace: K_ii resists it by the square of that, which a Cholesky factor
     # loses
     on_trace: float = 1e-6
-    # of (K⁺)_bb with a diagonal of ones, the inverse of its condition: below it the inverse, S, has
-    # lost more than half of the digits
-    invertible: float = 1e-8
+    # of (K⁺)_bb with a diagonal of ones, the inverse of its condition: below it soft parts of its
+    # inverse, S, are rounding of stiff ones; with cells of moduli 1 : 1e6 1e-8 was too little
+    invertible: float = 1e-6
 
 
 TOLERANCES = KernelTolerances()
