@@ -64,13 +64,7 @@ class Driven:
     """A box on a curved obstacle or a rough plane, clamped on the left, under a traction."""
 
     def __init__(
-        self,
-        cell="quadrilateral",
-        n=8,
-        subdomains=5,
-        rough=True,
-        friction=FRICTION,
-        **options,
+        self, cell="quadrilateral", n=8, subdomains=5, rough=True, friction=FRICTION, **options
     ):
         d = decomposed(cell, n, subdomains)
         gdim = d.mesh.geometry.dim

@@ -119,11 +119,7 @@ if __name__ == "__main__":
     if how in DEATHS:
         die_at(*DEATHS[how])
     steps = tfeti.LoadSteps(
-        driven.problem,
-        apply,
-        TIMES,
-        path=folder / "series.bp",
-        checkpoint=folder / "checkpoint",
+        driven.problem, apply, TIMES, path=folder / "series.bp", checkpoint=folder / "checkpoint"
     )
     records = steps.run(resume=how == "resume")
     x, u = displacement(driven.problem)

@@ -71,10 +71,7 @@ def least(A, b, B, c, normals):
     return inverse[:, -1] - inverse[:, :-1] @ (scale * found.x)
 
 
-CASES = [
-    ("quadrilateral", 1, 0.02, True, 0.0),
-    ("triangle", 2, 0.0, False, 0.1),
-]
+CASES = [("quadrilateral", 1, 0.02, True, 0.0), ("triangle", 2, 0.0, False, 0.1)]
 
 
 @pytest.mark.parametrize("case", CASES)

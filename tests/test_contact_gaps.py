@@ -92,12 +92,7 @@ def test_an_overhanging_wedge(cell, slope):
     n, gdim = 4, 2 if cell in CELLS[:2] else 3
     start = 0.5 if slope < 0.0 else -0.5
     d = shaped(
-        cell,
-        3,
-        n,
-        lambda x: 0.0 * x[:, 0],
-        lambda x: slope * (x[:, 0] - start),
-        across=(0.0, 1.15),
+        cell, 3, n, lambda x: 0.0 * x[:, 0], lambda x: slope * (x[:, 0] - start), across=(0.0, 1.15)
     )
     dofs = dofs_of(d)
     records = searched([sided(*ORDERS[0], reach=0.5)], dofs)

@@ -28,12 +28,7 @@ def scene(
 @pytest.mark.parametrize("sides", [(UPPER, LOWER), (LOWER, UPPER)])
 @pytest.mark.parametrize(
     ("n", "stiffness", "secondary"),
-    [
-        ((3, 6), 0.1, LOWER),
-        ((6, 3), 5.0, UPPER),
-        ((16, 15), 5.0, LOWER),
-        ((4, 4), 1.0, None),
-    ],
+    [((3, 6), 0.1, LOWER), ((6, 3), 5.0, UPPER), ((16, 15), 5.0, LOWER), ((4, 4), 1.0, None)],
 )
 def test_the_coarser_side_is_taken_and_of_equal_meshes_the_softer_one(
     n, stiffness, secondary, sides

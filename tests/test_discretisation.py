@@ -30,10 +30,7 @@ def test_shrink_fit(cells, degree, triangles):
 
 @pytest.mark.parametrize(
     ("scene", "sizes", "finest"),
-    [
-        *AGAINST_FINER,
-        pytest.param(ball, (3_000, 10_000, 30_000), 240_000, marks=pytest.mark.slow),
-    ],
+    [*AGAINST_FINER, pytest.param(ball, (3_000, 10_000, 30_000), 240_000, marks=pytest.mark.slow)],
 )
 def test_against_a_finer_mesh(serial_only, scene, sizes, finest):
     finer = scene(finest, **RTOL)

@@ -30,8 +30,7 @@ def test_example(name, comm):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["qp.mprgp", "qp.krylov", "qp.smalse", "qp.sets", "qp.projection", "qp.newton"],
+    "name", ["qp.mprgp", "qp.krylov", "qp.smalse", "qp.sets", "qp.projection", "qp.newton"]
 )
 def test_examples_of_solvers(name):
     failed, tried = doctest.testmod(import_module(f"tfeti_dolfinx.{name}"))

@@ -113,10 +113,7 @@ def string_beside(force, n=1500):
 
 @pytest.mark.parametrize(
     ("force", "reason"),
-    [
-        pytest.param(1.0, "CONVERGED_RTOL", marks=pytest.mark.slow),
-        (1e15, "DIVERGED_ROUNDING"),
-    ],
+    [pytest.param(1.0, "CONVERGED_RTOL", marks=pytest.mark.slow), (1e15, "DIVERGED_ROUNDING")],
 )
 def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
     """500 steps, and 500 with a new gradient; beside 1e30, what they gain is rounding of q."""

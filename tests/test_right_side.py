@@ -86,11 +86,7 @@ def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
     gluing = glue(dofs, held, records, 1.0, ones)
     assert d.comm.allreduce(len(gluing.contact.decided)) == 0
     near = glue(
-        dofs,
-        held,
-        searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs),
-        1.0,
-        ones,
+        dofs, held, searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs), 1.0, ones
     )
     assert d.comm.allreduce(len(near.contact.decided)) == 16
     c = np.array(near.constraints.c)

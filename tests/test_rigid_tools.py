@@ -471,6 +471,26 @@ def test_a_tool_that_is_lifted_leaves_an_elastic_body_at_rest():
     assert np.allclose((y[1], y[0]), (1e3 * y[3], y[4]), rtol=1e-3, atol=0.0)
 
 
+def test_a_free_body_that_friction_has_held_is_let_go():
+    """Pressed between a floor and a lid, drawn along, let go and pressed again."""
+    ways, floor = [(0.0, -0.1), (0.02, -0.1), (0.02, 0.1), (0.0, -0.1)], tfeti.Plane((0, 0), (0, 1))
+    for cell, mu, shape in (("triangle", 0.5, top(2)), ("quadrilateral", 0.2, ball(2, offset=0.2))):
+        V, _, v = vectors(decomposition := decomposed(cell, 6, 4))
+        u, law = fem.Function(V), {"friction": tfeti.Coulomb(mu)}
+        lid = tfeti.RigidBody(shape, displacement=lambda t: ways[int(t)], name="lid")
+        tools = [tfeti.Obstacle("bottom", floor, **law), tfeti.Obstacle("top", lid, **law)]
+        F = ufl.derivative(neo_hooke(u, 1.0, 0.3) * ufl.dx, u, v)
+        problem = tfeti.NonlinearContactProblem(F, u, [], tools, decomposition, finite=True)
+        for t in range(4):
+            problem.time = float(t)
+            problem.solve()
+            problem.accept()
+            forces = [problem.solution.contact(i).resultant.force for i in (0, 1)]
+            assert largest(np.add(*forces)) <= 1e-9
+            assert (largest(forces) <= 1e-12) == (t == 2)
+            assert t != 2 or largest([*u.x.array, problem.report.F_multiplications / 1e4]) < 0.05
+
+
 def ball_mesh(m):
     """Triangles of a ball of radius 1 about the origin."""
     panels = SPACE["ball"](m)

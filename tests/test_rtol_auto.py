@@ -37,11 +37,7 @@ def test_it_saves_a_third_and_spoils_nothing(serial_only, scene, sizes, finest):
         assert work(auto) <= work(exact) * 2 / 3
 
 
-LAWS = {
-    "no friction": None,
-    "bound": tfeti.Tresca(5e-3),
-    "Coulomb": tfeti.Coulomb(0.3),
-}
+LAWS = {"no friction": None, "bound": tfeti.Tresca(5e-3), "Coulomb": tfeti.Coulomb(0.3)}
 
 
 @pytest.mark.parametrize(

@@ -39,8 +39,7 @@ def shared(mesh, facets):
 
 
 @pytest.mark.parametrize(
-    ("cell", "degree", "component"),
-    list(zip(CELLS, (1, 2, 2, 1), (None, 1, None, 1), strict=True)),
+    ("cell", "degree", "component"), list(zip(CELLS, (1, 2, 2, 1), (None, 1, None, 1), strict=True))
 )
 def test_facets_on_tears_are_refused(cell, degree, component):
     d = decomposed(cell, 4, 4)

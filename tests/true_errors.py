@@ -41,10 +41,7 @@ def ball(unknowns, **options):
 
 
 # scenes in 2D, their sizes, and that of the mesh beside which they are judged
-AGAINST_FINER = [
-    (hertz, (6, 12), 30),
-    pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
-]
+AGAINST_FINER = [(hertz, (6, 12), 30), pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow)]
 
 
 def ring_problem(cells, degree, mesh, springs=1e-6, options=None, **contact):

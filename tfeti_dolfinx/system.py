@@ -457,6 +457,12 @@ class System:
         if self._subdomains is not None:
             loads = self.tools.loads[: self.tools.num_local]
             self._subdomains.update(f=np.append(self._dofs.to_primal(self._f), loads))
+            self._take_rounding(self._subdomains)
+
+    def _take_rounding(self, subdomains: Subdomains) -> None:
+        if self.forms.rounding is not None:
+            noise = self._dofs.to_primal(self.forms.rounding)
+            subdomains.load_rounding[: len(noise)] = noise
 
     def _factor(self) -> None:
         dofs, trace = self._dofs, self.gluing.constraints.trace
@@ -470,6 +476,7 @@ class System:
         )
         self._K, self._subdomains.tangents = None, self.follows
         self._subdomains.retrace(trace)
+        self._take_rounding(self._subdomains)
         self.inverses += 1
 
     def _make_dual(self) -> None:

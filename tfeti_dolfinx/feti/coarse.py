@@ -43,7 +43,7 @@ class CoarseSpace(Coarse):
 
     Attributes:
         dimension: r, the dimension of the kernel of K.
-        e: (R T)ᵀ f, shape ``(r,)``.
+        e: (R T)ᵀ f, shape ``(r,)``; 0 instead of rounding where only contact holds a body.
         motions: The bodies' motions in the basis T; ``work`` is the product of their transpose with
             an r-vector.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
@@ -105,7 +105,12 @@ class CoarseSpace(Coarse):
     def _load(self) -> Array:
         if not self.dimension:
             return np.zeros(0)
-        return self._basis.transposed(joined_over(self.comm, self.subdomains.kernel_load))
+        e = self._basis.transposed(joined_over(self.comm, self.subdomains.kernel_load))
+        basis, Z = self._basis, self.unheld
+        work = (Z.alone @ (Z.alone.T @ self.work(e))).reshape(Z.free.shape)
+        still = np.linalg.norm(work, axis=1) <= self.bodies.unloaded
+        e[np.flatnonzero((basis.unheld & still[:, None])[basis.kept])] = 0.0
+        return e
 
     def _on_bodies(self, Gt: csr_array) -> BodyRows:
         """Return the rows of B R over their size on motions of bodies, without what is rounding."""
@@ -122,8 +127,8 @@ class CoarseSpace(Coarse):
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
-        self.e = self._load()
         self.bodies.update_load()
+        self.e = self._load()
 
     def kernel_motion(self, alpha: Array) -> Array:
         """R T α of an r-vector on all unknowns of this rank, shape ``(n,)``."""

@@ -70,10 +70,13 @@ def recover(
     gap = residual - coarse.Gt @ alpha
     if (N := coarse.free_basis).shape[1]:  # gaps do not change
         u = u - coarse.kernel_motion(coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(u))))
-    # what sticks holds, pushed or not, and so do all rows of friction that carry a force
-    active = np.zeros(len(lam), dtype=bool)
-    active[coarse.bounded] = (np.abs(lam) > no_effect * error)[coarse.bounded]
+    # what sticks to a given bound holds, pushed or not; under Coulomb's law what is pushed or pulls
+    borne, active = np.abs(lam) > no_effect * error, np.zeros(len(lam), dtype=bool)
+    active[coarse.bounded] = borne[coarse.bounded]
     active[coarse.rubbing] = True
+    at = constraints.pressed
+    rows = constraints.sets.tangents[at]
+    active[rows] = (borne[constraints.pressed_by[at]] | np.any(borne[rows], axis=1))[:, None]
     active &= face.carrying
     return Recovered(np.array(lam), u, gap, residual, active)
 

@@ -316,7 +316,7 @@ class Bodies:
         unsprung: Motions that springs do not resist.
         loads: ‖f‖ of each body, shape ``(bodies,)``.
         negligible: Work of each body's load, on a motion of mean square 1, that counts as none,
-            shape ``(bodies,)``.
+            and ``unloaded``, that is rounding; shape ``(bodies,)``.
     """
 
     def __init__(self, subdomains: Subdomains) -> None:
@@ -338,12 +338,14 @@ class Bodies:
 
     def update_load(self) -> None:
         """Measure the Blocks' present loads. Collective."""
-        squares = [[float(block.load @ block.load) for block in self._subdomains.blocks]]
-        self.loads = np.sqrt(self._subdomains.body_sums(squares)[0])
-        largest = self.loads * np.sqrt(self.nodes)
-        self.negligible = np.maximum(
-            TOLERANCES.balance * largest, TOLERANCES.rounding * largest.max(initial=0.0)
-        )
+        subdomains, own = self._subdomains, self._subdomains.load_rounding
+        squares = [[float(block.load @ block.load) for block in subdomains.blocks]]
+        squares += [[float(own[part] @ own[part]) for part in subdomains.dof_parts]]
+        self.loads, noise = np.sqrt(subdomains.body_sums(squares))
+        largest, noise = self.loads * np.sqrt(self.nodes), noise * np.sqrt(self.nodes)
+        noise = np.maximum(noise, TOLERANCES.rounding * largest.max(initial=0.0))
+        self.negligible = np.maximum(TOLERANCES.balance * largest, noise)
+        self.unloaded = noise
 
     def part_of(self, u: Array) -> Array:
         """Coordinates of the bodies' motion in u, by least squares over the nodes. Collective."""

@@ -57,8 +57,11 @@ class Forms:
         given: The forms as they were given, by their names.
         thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
             set.
+        rounding: What rounding may have made of each entry of the last load, if that is more than
+            a share of it; else None.
     """
 
+    rounding: Array | None = None
     names: ClassVar[tuple[str, str]] = ("a", "L")
 
     def __init__(

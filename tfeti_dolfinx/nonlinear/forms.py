@@ -17,6 +17,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import assemble_csr, geometry_dofmap
+from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -68,6 +69,10 @@ class NewtonForms(Forms):
         self._reference = self._x.copy() if finite else None
         self._matrix: csr_array | None = None
         self._entries: la.MatrixCSR | None = None
+        mesh, tdim = u.function_space.mesh, u.function_space.mesh.topology.dim
+        cells = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
+        # strains are differences to the identity, and displacements of nodes to those beside them
+        self._length = float(mesh.h(tdim, cells).max(initial=0.0)) if finite else 0.0
         super().__init__(J, F, *as_forms)
         dead = dead_loads(F, u)
         self._dead = None if dead.empty() else self._compiled(dead, self.names[1])
@@ -94,7 +99,9 @@ class NewtonForms(Forms):
         u, dead = self._u.x.array[: self._matrix.shape[1]], self.dead()
         self.at_model = self.residual() if self.known is None else self.known
         found = self._matrix @ u - self.at_model + dead
-        found[abs(found) <= ROUNDING * (abs(self._matrix) @ abs(u))] = 0.0
+        rounding = ROUNDING * (abs(self._matrix) @ (abs(u) + self._length))
+        found[abs(found) <= rounding] = 0.0
+        self.rounding = rounding * (not any_rank(self._decomposition.comm, dead))
         return np.asarray(found - dead)
 
     def dead(self) -> Any:

@@ -271,7 +271,11 @@ class NonlinearContactProblem(ContactProblem):
             )
 
     def _solve_linearised(self, rtol: float, warns: bool) -> None:
-        """Solve the contact problem of the model at u; the last one warns. Collective."""
+        """Solve the contact problem of the model at u; the last one warns. Collective.
+
+        A kept model without an answer, as its places may hold no body that turns, is made anew.
+        """
+        u, again = np.array(self.u.x.array), False
         warns &= self._settings.options.warnings
         atol = max(self._atol, self._last_digit)
         self.options = replace(self.options, rtol=rtol, atol=atol, warnings=warns)
@@ -281,10 +285,18 @@ class NonlinearContactProblem(ContactProblem):
         try:
             self._system.look_for_changes()
             self._solve_in_rounds()
+        except TfetiError:  # on all ranks
+            if not self._newton_forms.kept:
+                raise
+            self._newton_forms.kept = self._keeping.kept = False
+            again = True
         finally:
             self._newton_forms.known = None
             if self._places is not None:
                 self._places.back()
+        if again:
+            self._set(u)
+            self._solve_linearised(rtol, warns)
 
     def _go_to_places(self, places: CurrentPlaces) -> None:
         """Let contact and rigid motions be those of X + u. Collective."""

@@ -60,6 +60,7 @@ class NewtonParameters:
     # what a solve on a face that stays reduces its residual to, before step 1 looks at it
     stage: float = 0.1
     patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
+    circle: int = 20  # looks at a ‖g^P‖ that is not halved that count as one even where q falls
     # of the gradient: multipliers of Gλ = e that make it longer than that are rounding of motions
     # that a face does not see
     unfelt: float = 1e6
@@ -155,15 +156,23 @@ def growth(coarse: Coarse, lam: Array) -> float:
     return float(c) if c > 0.0 and imbalance(coarse, c * lam) <= HELD else 1.0
 
 
-def multipliers_at(qp: QP, z: Point) -> Array:
-    """Return the μ of least squares at λ: that of the rows that hold what they multiply there.
+def multipliers_at(
+    qp: QP, z: Point, on_face: Coarse | None = None, unfelt: float = NewtonParameters.unfelt
+) -> Array:
+    """Return the μ of least squares at λ on a face, 0 where they are rounding. Collective.
 
-    Open rows and those on the boundary of a disc, which slip, do not. Collective.
+    Without a face that of the rows that hold what they multiply there: open rows and those on the
+    boundary of a disc, which slip, do not. Of motions that a face does not see μ is rounding over
+    rounding: it makes the gradient longer than ``unfelt`` times itself.
     """
-    face = qp.feasible.face(z.lam, -z.lam)
-    holds = (face.status == Status.FREE) | (face.holding & (z.lam != 0.0))
-    coarse = qp.coarse.on_face(Face(holds, face.status))
-    return coarse.coordinates(z.g)
+    if on_face is None:
+        face = qp.feasible.face(z.lam, -z.lam)
+        holds = (face.status == Status.FREE) | (face.holding & (z.lam != 0.0))
+        on_face = qp.coarse.on_face(Face(holds, face.status))
+    mu = on_face.coordinates(z.g)
+    s = z.g - qp.coarse.combined(mu)
+    left, size = qp.dot((s, s), (z.g, z.g))
+    return mu if left <= unfelt**2 * size else 0.0 * mu
 
 
 # --- State of the iteration -------------------------------------------------------------------
@@ -182,10 +191,9 @@ class NewtonIteration:
         pressed: The face of λ̂: a row that carries less than it is open by, λ_i < ᾱs_i, is open.
             Where forces are rounding of 0 they do not say which rows touch.
         residual: ‖g^P‖, g^P = (λ − λ̂)/ᾱ.
-        norm: Estimate of ‖F‖; ᾱ is its inverse.
-        rounding: What rounding may make of ‖g^P‖ alone.
+        norm: Estimate of ‖F‖; ᾱ is its inverse. rounding: What that may make of ‖g^P‖ alone.
         least: The last ‖g^P‖ that was half of the one before.
-        idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
+        idle: So many looks in a row have found neither q nor ‖g^P‖ lower; since: ‖g^P‖ not.
         resume: Whether λ is where PCPG has stopped.
     """
 
@@ -197,7 +205,7 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
         self.pressed = qp.feasible.face(z.lam, z.g)
         self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.resume = 0, False
+        self.idle, self.since, self.resume = 0, 0, False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
@@ -211,11 +219,7 @@ class NewtonIteration:
                 seen(qp.dot((p, qp.F(p)))[0], pp)
         self.norm = self.solver.directions.norm or 1.0
         if self.resume:
-            mu = self.solver.coarse.coordinates(self.z.g)
-            s = self.z.g - normal(mu)
-            # of motions that the face does not see μ is rounding over rounding
-            left, size = qp.dot((s, s), (self.z.g, self.z.g))
-            self.mu = mu if left <= self.parameters.unfelt**2 * size else 0.0 * mu
+            self.mu = multipliers_at(qp, z, self.solver.coarse, self.parameters.unfelt)
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
         self.s = self.z.g - normal(self.mu)
         wanted = self.z.lam - self.s / self.norm
@@ -227,9 +231,9 @@ class NewtonIteration:
         square, size = qp.dot((moved, moved), (self.z.lam, self.z.lam))
         self.residual = self.norm * np.sqrt(square)
         self.rounding = self.parameters.lost * self.norm * np.sqrt(size)
-        self.idle += 1
+        self.idle, self.since = self.idle + 1, self.since + 1
         if self.residual <= 0.5 * self.least:
-            self.least, self.idle = self.residual, 0
+            self.least, self.idle, self.since = self.residual, 0, 0
 
     def examine(self, rule: StoppingRule) -> ConvergedReason:
         """Apply the stopping rule where ‖g^P‖ is small enough."""
@@ -310,7 +314,7 @@ class NewtonIteration:
         z = self.z
         work, load = self.qp.dot((z.lam, z.g), (z.lam, self.qp.d))
         if gain > self.parameters.hidden * (abs(work) + abs(load)):
-            self.idle = 0
+            self.idle = self.since // self.parameters.circle
         self.z = to
 
 
@@ -549,7 +553,7 @@ def newton(
     z = Point(homogenised.lam_bar, homogenised.gradient)
     mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
     if mu is None:
-        mu = multipliers_at(qp, z)
+        mu = multipliers_at(qp, z, unfelt=parameters.unfelt)
     state = NewtonIteration(qp, solver, parameters, z, mu)
     monitor(steps, "start", homogenised.lam_bar, norm_over(qp.coarse.comm, homogenised.b), 0.0)
     friction = any_rank(qp.coarse.comm, state.pressed.status >= RUBS)

@@ -165,7 +165,8 @@ def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, 
     known = motion is not None or result.reason == ConvergedReason.DIVERGED_CONTRADICTION
     if not known and state is not None and dual.contact_rows[1] and coarse.dimension:
         slip, bends = (np.abs(x) / coarse.row_size for x in (state.gap, state.residual))
-        if largest(coarse.comm, slip[coarse.rubbing]) > most * largest(coarse.comm, bends):
+        rubs = coarse.rubbing[state.active[coarse.rubbing]]  # what is let go may go anywhere
+        if largest(coarse.comm, slip[rubs]) > most * largest(coarse.comm, bends):
             motion = coarse.bodies.part_of(state.u)
     if motion is None:
         return ""
@@ -227,17 +228,21 @@ class FrictionBounds:
         return None
 
     def turn(self, reason: ConvergedReason) -> bool:
-        """Let all slip where sticking contradicts itself, as beside a wall that pushes, once.
+        """Let all stick where no forces within the bounds are found to balance a load, once.
 
-        Or stick, where no forces within the bounds of an earlier step are found to balance a load,
-        as of one that was far smaller. Return whether there are other bounds.
+        They may be those of an earlier load that was far smaller. Or slip, once, where sticking
+        contradicts itself, as beside a wall that pushes, or where bounds of forces that are gone
+        leave a body that is let go to rounding. Return whether there are other bounds.
         """
-        if self.stick and not self._slipped and reason == ConvergedReason.DIVERGED_CONTRADICTION:
-            self.now, self._slipped = np.zeros(len(self._rows)), True
+        stalled = reason == ConvergedReason.DIVERGED_STALLED
+        if stalled and not self._stuck:
+            self.now, self._stuck = np.full(len(self._rows), np.inf), True
             return True
-        if reason != ConvergedReason.DIVERGED_STALLED or self._stuck:
+        contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
+        lost = stalled or contradicts or reason == ConvergedReason.DIVERGED_ROUNDING
+        if not lost or self._slipped:
             return False
-        self.now, self._stuck = np.full(len(self._rows), np.inf), True
+        self.now, self._slipped = np.zeros(len(self._rows)), True
         return True
 
     def change(self, values: Array) -> float:
@@ -309,6 +314,8 @@ class FrictionBounds:
         """Flags of rows on bodies that friction may hold, and whose forces tell nothing of it."""
         coarse, rows = self._dual.coarse, np.zeros(self._constraints.num_rows, dtype=bool)
         loose = np.any(coarse.unheld.free, axis=1) & (self._on_bodies(self.now) == 0.0)
+        # where slips count from elsewhere, a body was let go, and would be drawn back there
+        loose &= not any_rank(self._comm, self._constraints.c[self._constraints.sets.tangents])
         rows[coarse.J.row[loose[coarse.J.body]]] = True
         tangents = self._constraints.sets.tangents[self._constraints.pressed]
         return np.any(rows[tangents], axis=1) & (self._mu > 0.0)

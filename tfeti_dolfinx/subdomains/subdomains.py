@@ -84,6 +84,7 @@ class Subdomains:
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         elastic_parts: Each of the Blocks that have nodes, with its part of the n unknowns.
         size: n.
+        load_rounding: What rounding may have made of each entry of the load, shape ``(n,)``.
         trace_parts: Where the trace unknowns of each Block lie among the t, dof_parts its unknowns
             among the n, and kernel_parts its kernel coordinates among the r.
         diagonal: On the trace, the mean of the diagonal of K at each node, shape ``(t,)``.
@@ -111,6 +112,7 @@ class Subdomains:
         self.kernel_parts = parts_of([block.kernel.shape[1] for block in self.blocks])
         self.elastic_parts = list(zip(self.elastic, self.dof_parts, strict=False))
         self.size = sum(len(block.load) for block in self.blocks)
+        self.load_rounding: Array = np.zeros(self.size)
         self._read_trace()
         self._pinv_load: Array | None = None
         self._solves: list[tuple[Callable[[Array], Array], Array]] | None = None
