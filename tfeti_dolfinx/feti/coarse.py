@@ -107,7 +107,7 @@ class CoarseSpace(Coarse):
             return np.zeros(0)
         e = self._basis.transposed(joined_over(self.comm, self.subdomains.kernel_load))
         basis, Z = self._basis, self.unheld
-        work = (Z.alone @ (Z.alone.T @ self.work(e))).reshape(Z.free.shape)
+        work = np.einsum("bij,bi->bj", Z.single, self.work(e).reshape(Z.free.shape)) * Z.free
         still = np.linalg.norm(work, axis=1) <= self.bodies.unloaded
         e[np.flatnonzero((basis.unheld & still[:, None])[basis.kept])] = 0.0
         return e

@@ -81,12 +81,13 @@ def project_onto_feasible(
         step = coarse.damped_solve(face.damped(), trial.residual, damping)
         slope = float(bcast_from_root(comm, float(trial.residual @ step)))
         # where the cost is least along the step, its slope is 0: that falls, and where bodies are
-        # hardly held all of a sudden, past the row that stops them. From beyond, by secants
+        # hardly held all of a sudden, past the row that stops them. From beyond, by secants. Down
+        # to the slope of the start, the other way, a step has not raised the cost
         start, length, near, beyond = trial, 1.0, 0.0, list[tuple[float, float]]()
         while True:
             trial, trials = _trial(coarse, feasible, y, start.alpha + length * step), trials + 1
             left = float(bcast_from_root(comm, float(trial.residual @ step)))
-            if abs(left) <= parameters.left * slope or (length == 1.0 and left > 0.0):
+            if -slope < left <= parameters.left * slope or (length == 1.0 and left > 0.0):
                 break
             if left > 0.0:
                 near = length
