@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
@@ -27,7 +27,7 @@ class ProjectionParameters:
     nearly: float = 1e-6
     slow: float = 0.1  # share of what is left
     # so many such steps in a row, with the least damping, and rounding has ended it
-    slowly: int = 16
+    slowly: int = 8
     # of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small
     # beside 1, so that they stay Newton's
     damping: float = 1e-8
@@ -35,12 +35,12 @@ class ProjectionParameters:
     # factor on the damping after a whole step that has met no row but it: those of the face may be
     # so soft beside open ones that they hold by less
     eased: float = 0.01
-    shortest: float = 1e-12  # of Newton's step: less changes nothing that is left above rounding
-    # of the slope at its start: a step that leaves as much goes on, a whole one has met only the
-    # damping
+    shortest: float = 1e-8  # of Newton's step: less changes nothing that is left above rounding
+    # of the slope at its start: a whole step that leaves as much has met only the damping
     left: float = 0.5
     # after so many of these in a row nothing in Ω fulfils Gλ = e but for rounding
     patience: int = 10
+    rounding: float = 1e-14  # of the cost: what rounding may add to it
 
 
 DEFAULT = ProjectionParameters()
@@ -79,38 +79,28 @@ def project_onto_feasible(
             break
         face = feasible.face(trial.lam, trial.lam - trial.z)
         step = coarse.damped_solve(face.damped(), trial.residual, damping)
-        slope = float(bcast_from_root(comm, float(trial.residual @ step)))
-        # where the cost is least along the step, its slope is 0: that falls, and where bodies are
-        # hardly held all of a sudden, past the row that stops them. From beyond, by secants. Down
-        # to the slope of the start, the other way, a step has not raised the cost
-        start, length, near, beyond = trial, 1.0, 0.0, list[tuple[float, float]]()
+        slope = float(trial.residual @ step)
+        # halve the step until it does not raise the cost; where that still falls at the end of a
+        # step, it fell along all of it, as it is convex, however rounding hides its difference
+        start, length = trial, 1.0
         while True:
             trial, trials = _trial(coarse, feasible, y, start.alpha + length * step), trials + 1
-            left = float(bcast_from_root(comm, float(trial.residual @ step)))
-            if -slope < left <= parameters.left * slope or (length == 1.0 and left > 0.0):
+            fell = trial.cost <= start.cost + parameters.rounding * abs(start.cost)
+            fell = fell or float(trial.residual @ step) >= 0.0
+            if bcast_from_root(comm, fell or length <= parameters.shortest):
                 break
-            if left > 0.0:
-                near = length
-            else:
-                beyond = [*beyond[-1:], (length, left)]
-            (a, at_a), (b, at_b) = beyond[0], beyond[-1]
-            narrow = b - near <= parameters.shortest * b or b <= parameters.shortest
-            if narrow or trials >= parameters.max_trials:
-                break
-            length = np.sqrt(near * b) if near else b * slope / (slope - at_b)
-            if left < 0.0 and at_a != at_b:
-                guess = b - at_b * (b - a) / (at_b - at_a)
-                length = guess if near < guess < b else length
-        whole = length == 1.0 and left > parameters.left * slope
+            length *= 0.5
+        left = float(trial.residual @ step)
+        whole = bcast_from_root(comm, length == 1.0 and left > parameters.left * slope)
         unmet = unmet + 1 if whole else 0
         if whole:
             damping = max(parameters.eased * damping, parameters.least_damping)
         elif length < 1.0 and slowly == 0:
             damping = parameters.damping
-        settles = parameters.slow * least < trial.left <= parameters.nearly * scale
-        slow = bcast_from_root(comm, settles)
+        near = trial.left <= parameters.nearly * scale
+        slow = bcast_from_root(comm, near and trial.left > parameters.slow * least)
         slowly, least = slowly + 1 if slow else 0, min(least, trial.left)
-        if length <= parameters.shortest or slowly > parameters.slowly:
+        if bcast_from_root(comm, length <= parameters.shortest) or slowly > parameters.slowly:
             break
         if slow:
             damping = parameters.least_damping
@@ -143,17 +133,20 @@ class WithinFace:
 
 @dataclass(frozen=True)
 class _Trial:
-    """λ(α) = P_Ω(z), e − Gλ(α) and ‖e − Gλ‖."""
+    """λ(α) = P_Ω(z), e − Gλ(α), the cost there and ‖e − Gλ‖."""
 
     alpha: Array
     z: Array
     lam: Array
     residual: Array
+    cost: float
     left: float
 
 
 def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: Array) -> _Trial:
     z = y + coarse.combined(alpha)
     lam = feasible.project(z)
-    residual = coarse.residual(lam)
-    return _Trial(alpha, z, lam, residual, float(np.sqrt(residual @ residual)))
+    own = float(z @ lam) - 0.5 * float(lam @ lam)
+    (cost,), residual = summed(coarse.comm, np.array([own])), coarse.residual(lam)
+    length = float(np.sqrt(residual @ residual))
+    return _Trial(alpha, z, lam, residual, float(cost - alpha @ coarse.e), length)
