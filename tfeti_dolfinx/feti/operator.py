@@ -208,14 +208,14 @@ def chosen_preconditioner(
     Where a subdomain keeps its volume, or springs hold one, the lumped one takes many times as many
     steps; there, in tangents, in clusters, and beside other Blocks it is Dirichlet's.
     """
+    if subdomains.tangents:
+        return dirichlet_preconditioner(B, subdomains)
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
-    other = subdomains.tangents or subdomains.num_clusters or len(sparse) < len(subdomains.elastic)
+    other = subdomains.num_clusters > 0 or len(sparse) < len(subdomains.elastic)
     dear = any(block.stiffness.entries > choice.dear * block.stiffness.size for block in sparse)
     held = any(block.kernel.shape[1] < block.modes.shape[1] for block in sparse)
     stiff = any(block.stiffness.stretch_over_shear > choice.volume for block in sparse)
-    if any_rank(subdomains.comm, dear) and not any_rank(
-        subdomains.comm, bool(other or held or stiff)
-    ):
+    if any_rank(subdomains.comm, dear) and not any_rank(subdomains.comm, other or held or stiff):
         return LateDirichlet(B, subdomains, choice.steps)
     return dirichlet_preconditioner(B, subdomains)
 

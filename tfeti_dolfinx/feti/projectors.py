@@ -113,7 +113,7 @@ def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
 # --- Factors of the coarse problem ------------------------------------------------------------
 
 # Added to a unit diagonal, where pivots are lost to rounding, as on faces that leave a body free
-SHIFTS = (0.0, 1e-14, 1e-13, 1e-12, 1e-10, 1e-8, 1e-6)
+SHIFTS = (0.0, 1e-14, 1e-13, 1e-12)
 
 
 class NullModes:

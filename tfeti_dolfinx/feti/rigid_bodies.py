@@ -316,7 +316,7 @@ class Bodies:
         unsprung: Motions that springs do not resist.
         loads: ‖f‖ of each body, shape ``(bodies,)``.
         negligible: Work of each body's load, on a motion of mean square 1, that counts as none,
-            and ``unloaded``, that is rounding; shape ``(bodies,)``.
+            and ``unloaded``, that is its own rounding; shape ``(bodies,)``.
     """
 
     def __init__(self, subdomains: Subdomains) -> None:
@@ -343,9 +343,9 @@ class Bodies:
         squares += [[float(own[part] @ own[part]) for part in subdomains.dof_parts]]
         self.loads, noise = np.sqrt(subdomains.body_sums(squares))
         largest, noise = self.loads * np.sqrt(self.nodes), noise * np.sqrt(self.nodes)
-        noise = np.maximum(noise, TOLERANCES.rounding * largest.max(initial=0.0))
-        self.negligible = np.maximum(TOLERANCES.balance * largest, noise)
-        self.unloaded = noise
+        self.unloaded = np.maximum(noise, TOLERANCES.rounding * largest)
+        others = np.maximum(noise, TOLERANCES.rounding * largest.max(initial=0.0))
+        self.negligible = np.maximum(TOLERANCES.balance * largest, others)
 
     def part_of(self, u: Array) -> Array:
         """Coordinates of the bodies' motion in u, by least squares over the nodes. Collective."""
