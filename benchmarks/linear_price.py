@@ -25,7 +25,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import tfeti_dolfinx as tfeti
-from benchmarks import stages
 from benchmarks.tools import (
     choose_clock,
     command_line,
@@ -216,13 +215,12 @@ def available(kind, setting, comm):
 # --- Contact beside it ---------------------------------------------------------------------------
 
 OTHERS = [kind for kind in SETTINGS if kind != "GAMG"]
+# arguments of the demos, by the size of the run
+CUBES = {"quick": (8, 4), "default": (64, 10), "large": (512, 10)}
+BALLS = {"quick": (4_000, 4), "default": (235_000, 64), "large": (2_090_000, 256)}
 SCENES = {
-    "cube_3d": stages.DEMOS["cube_3d"],
-    "hertz_3d": {
-        "quick": stages.DEMOS["hertz_3d"]["quick"],
-        "default": stages.DEMOS["hertz_3d"]["large"],
-        "large": ["--unknowns", 2_090_000, "--subdomains", 256],
-    },
+    "cube_3d": {name: ["--subdomains", n, "--cells", m] for name, (n, m) in CUBES.items()},
+    "hertz_3d": {name: ["--unknowns", m, "--subdomains", n] for name, (m, n) in BALLS.items()},
 }
 
 

@@ -21,11 +21,9 @@ PICTURES = ROOT / "docs/pictures"
 SIZES = {"talk_hertz_2d": ["--subdomains", "32"]}
 # of a benchmark, its name and arguments
 BENCHMARKS = {
-    "kplus_forms": ["kplus_forms"],
     "performance_price": ["linear_price"],
     "performance_talk": ["talk_tables"],
     "performance_weak": ["scaling", "weak"],
-    "spectrum": ["spectrum"],
     "time_against_error": ["time_against_error"],
 }
 

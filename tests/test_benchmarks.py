@@ -10,16 +10,13 @@ import pytest
 from benchmarks import (
     ablation,
     curved_gaps,
-    kplus_forms,
     linear_price,
     nonlinear_steps,
     pressures,
     ranks,
     scaling,
     solver_profiles,
-    spectrum,
     stability,
-    stages,
     talk_tables,
     time_against_error,
     tools,
@@ -40,15 +37,12 @@ def with_arguments(benchmark, *arguments, slow=False):
 
 START_MPIRUN = (ranks, solver_profiles, scaling, time_against_error)
 # whose pictures pages show
-DRAWN = (kplus_forms, linear_price, scaling, spectrum, talk_tables, time_against_error)
+DRAWN = (linear_price, scaling, talk_tables, time_against_error)
 RUNS = [
     with_arguments(curved_gaps),
-    with_arguments(kplus_forms),
-    with_arguments(linear_price, "--scenes", "cube_3d"),
+    with_arguments(linear_price, "--scenes", "cube_3d", "--processor"),
     with_arguments(ranks),
-    with_arguments(spectrum),
     with_arguments(stability, "--groups", "nu"),
-    with_arguments(stages, "--processor"),
     with_arguments(scaling, "strong", "--ranks", "2"),
     with_arguments(talk_tables, "--rtol", "1e-4"),
     with_arguments(solver_profiles, "--steps", "100", slow=True),
@@ -135,9 +129,9 @@ def test_pressures_are_compared_as_functions():
 
 def test_tables_go_between_their_marks(tmp_path):
     page = tmp_path / "page.md"
-    mark = "before\n<!-- spectrum: {}, at {} -->\n\n| old |\n\n<!-- end -->\nafter\n"
+    mark = "before\n<!-- scenes: {}, at {} -->\n\n| old |\n\n<!-- end -->\nafter\n"
     page.write_text(mark.format("2D", "abc123") + mark.format("3D", "abc123"))
-    tools.write_documents("spectrum", {"2D": [{"κ": 7.5, "rows": 3}]}, "def456", tmp_path)
+    tools.write_documents("scenes", {"2D": [{"κ": 7.5, "rows": 3}]}, "def456", tmp_path)
     text = page.read_text()
     assert (
         "2D, at def456 -->\n\n| κ | rows |\n|---|---|\n| 7.5 | 3 |\n\n<!-- end -->\nafter" in text
