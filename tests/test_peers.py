@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from benchmarks.error_scenes import SCENES
-from benchmarks.peers import compare, mesh_file
+from benchmarks.peers import compare
 
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_meshes_and_decks_are_those_of_the_scene(serial_only, tmp_path, monkeypatch, order):
     monkeypatch.syspath_prepend(str(compare.HERE))
     calculix = importlib.import_module("calculix_hertz")
-    mesh_file.main(["4", str(order), str(tmp_path / "mesh.npz")])
+    importlib.import_module("half_cylinder").mesh(4, order, tmp_path / "mesh.npz")
     data = np.load(tmp_path / "mesh.npz")
     x, cells = data["points"], data["cells"]
     assert np.allclose(np.linalg.norm(x[data["contact"]] - [0.0, 1.0], axis=2), 1.0, atol=1e-9)
@@ -24,15 +24,18 @@ def test_meshes_and_decks_are_those_of_the_scene(serial_only, tmp_path, monkeypa
         cell, opposite = data[f"{name} cells"].T
         facets = np.column_stack((data[name][:, :2], cells[cell, opposite]))
         assert np.array_equal(np.sort(facets, axis=1), np.sort(cells[cell, :3], axis=1))
-    deck = calculix.deck(data, 1e3)
+    deck = calculix.deck(data)
     loads = [line.split(",") for line in deck.split("*DLOAD\n")[1].splitlines() if ", P" in line]
     assert len(loads) == len(data["top"])
-    assert float(loads[0][2]) * calculix.length(data) == pytest.approx(float(data["load"]))
+    ends = x[data["top"][:, :2]]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
+    assert float(loads[0][2]) * length == pytest.approx(float(data["load"]))
     assert deck.count("\n*ELEMENT") == 2
 
 
-def test_pressures_are_judged_at_equal_errors(serial_only, tmp_path):
+def test_pressures_are_judged_at_equal_errors(serial_only, tmp_path, monkeypatch):
     """A program with the closed form's pressure, another with a tenth more of it on fine meshes."""
+    monkeypatch.syspath_prepend(str(compare.HERE))
     scene, folder = SCENES["half cylinder"](), tmp_path / "peers"
     folder.mkdir()
     x = np.linspace(-0.06, 0.06, 4001)
@@ -47,38 +50,40 @@ def test_pressures_are_judged_at_equal_errors(serial_only, tmp_path):
     put("reference", ours(1.0, 1.0))
     exact = np.interp(x, scene.samples.points[:, 0], scene.exact)
     for size, error in ((6, 0.08), (12, 0.001)):
-        put(f"1_{size}_ours", ours(size / 6, 1.0 + error))
+        put(f"1_{size}_{compare.NAME}", ours(size / 6, 1.0 + error))
         peer = {"program": "Peer", "seconds": 5.0 * size / 6, "points": x.tolist()}
         put(f"1_{size}_peer", {**peer, "values": (exact * (1.0 + error)).tolist()})
     put("2_6_peer", {"failed": "no convergence"})
-    rows, equal = compare.write(folder).values()
+    half_cylinder = importlib.import_module("half_cylinder").SCENE
+    rows, equal = compare.write(half_cylinder, folder).values()
     assert [row["program"] for row in rows] == [compare.NAME] * 2 + ["Peer"] * 2
     assert [row["pressure"] for row in rows] == pytest.approx([0.08, 0.001] * 2, rel=0.02)
     assert equal[1]["1.0%"] == pytest.approx(5.0 * equal[0]["1.0%"], rel=0.01)
     assert (tmp_path / "peers.png").read_bytes().startswith(b"\x89PNG")
 
 
-PRESSED = ("pressed_disc", "quarter_disc", 8, 4.0 * np.sin(np.pi / 16.0), 0.2527)
-INDENTED = ("indentation", "block", 4, 4.0, 3.445e-4)
+PRESSED = ("pressed_disc", 8, 4.0 * np.sin(np.pi / 16.0), 0.2527)
+INDENTED = ("indentation", 4, 4.0, 3.445e-4)
 
 
-@pytest.mark.parametrize(("name", "mesh", "n", "area", "finest"), [PRESSED, INDENTED])
-def test_a_peer_is_judged_by_its_force(serial_only, monkeypatch, name, mesh, n, area, finest):
+@pytest.mark.parametrize(("name", "n", "area", "finest"), [PRESSED, INDENTED])
+def test_a_peer_is_judged_by_its_force(serial_only, monkeypatch, tmp_path, name, n, area, finest):
     """A coarse mesh presses as hard as the finest of the page, but for 2 %."""
     monkeypatch.syspath_prepend(str(compare.HERE))
-    scene, forces = importlib.import_module(name), importlib.import_module("forces")
-    points, cells = getattr(scene, mesh)(n)
+    scene, folder = importlib.import_module(name).SCENE, tmp_path / "peers"
+    points, cells = scene.mesh(n)
     areas = np.linalg.det(np.diff(points[cells], axis=1)) / 2
     assert areas.min() > 0.0
     assert areas.sum() == pytest.approx(area)
-    force, _, _ = scene.ours(points, cells)()
-    assert force == pytest.approx(finest, rel=0.02)
-    rows = []
-    for program, off in zip(("GetFEM", compare.NAME), (1e-5, -1e-5), strict=True):
-        made = {"program": program, "n": n, "seconds": len(program), "force": force}
-        finer = {"n": 2 * n, "seconds": 9 * len(program), "force": finest * (1.0 + off)}
-        rows += [made, {**made, **finer}]
-    rows, table = forces.tables_of(rows, name).values()
-    assert [row["error"] for row in rows[1::2]] == pytest.approx([1e-5, 1e-5], rel=1e-3)
+    found = scene.prepare(compare.NAME, n, None)()
+    assert found["force"] == pytest.approx(finest, rel=0.02)
+    folder.mkdir()
+    for program, off in zip((compare.NAME, "GetFEM"), (-1e-5, 1e-5), strict=True):
+        made = {"program": program, **found, "seconds": len(program), "MB": 1.0}
+        finer = {"seconds": 9 * len(program), "force": finest * (1.0 + off)}
+        for size, row in ((n, made), (2 * n, {**made, **finer})):
+            (folder / f"{name}_{size}_{program}.json").write_text(json.dumps(row))
+    rows, table = compare.write(scene, folder).values()
+    assert [row["error"] for row in rows[2:]] == pytest.approx([1e-5, 1e-5], rel=1e-3)
     seconds = [row["0.1%"] for row in table]
-    assert seconds[0] / seconds[1] == pytest.approx(len("GetFEM") / len(compare.NAME))
+    assert seconds[0] / seconds[1] == pytest.approx(len(compare.NAME) / len("GetFEM"))

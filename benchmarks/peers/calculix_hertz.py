@@ -1,19 +1,15 @@
 """CalculiX: face-to-face penalty contact with a block whose nodes are all fixed.
 
-    benchmarks/peers/run python3 benchmarks/peers/calculix_hertz.py MESH.npz FILE.json [K]
-
-K times E/a is the slope of pressure over overclosure. Plane strain, which CalculiX makes of one
+1000 E/a is the slope of pressure over overclosure. Plane strain, which CalculiX makes of one
 layer of solid elements; linear geometry, one increment, SPOOLES. The block overlaps where the
-surfaces will touch, so that the body is held. The deck stands beside FILE.json, as FILE.inp.
+surfaces will touch, so that the body is held.
 """
 
-import resource
 import subprocess
-import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
-from judged import best, length, write
 from scipy.spatial import cKDTree
 
 FACE = np.array([2, 3, 1])  # CalculiX' face opposite of each corner
@@ -56,7 +52,7 @@ SLAVE, MASTER
 """
 
 
-def deck(data, slope):
+def deck(data, slope=1e3):
     """The input of CalculiX."""
     n, cells = len(data["points"]), data["cells"]
     a, R, E, nu = (float(data[name]) for name in ("a", "R", "E", "nu"))
@@ -64,7 +60,7 @@ def deck(data, slope):
     block = [(-wide, up - a), (wide, up - a), (wide, up), (-wide, up)]
     tool, nodes = ("CPE4", "S3", np.arange(n + 1, n + 5)), np.concatenate((data["points"], block))
     body = begin(nodes, cells, data["contact cells"], tool, f"*ELASTIC\n{E}, {nu}", slope * E / a)
-    load = float(data["load"]) / length(data)
+    load = float(data["traction"])
     return f"""{body}*BOUNDARY
 TOOL, 1, 2, 0.0
 {rows((node, 1, 1, 0.0) for node in np.unique(data["axis"]) + 1)}
@@ -105,16 +101,14 @@ def on_contact(data, file):
     return x[nodes, 0], (total / np.maximum(np.bincount(node, minlength=len(x)), 1))[nodes]
 
 
-def main(argv):
-    """Write the deck, run CalculiX, and write the pressure with what it took."""
-    data, job = np.load(argv[0]), Path(argv[1]).with_suffix("")
-    job.with_suffix(".inp").write_text(deck(data, float(argv[2]) if len(argv) > 2 else 1e3))
-    run = best(lambda: solved(job), resource.RUSAGE_CHILDREN)
-    steps = run["found"].count(" iteration ")
-    run["found"] = on_contact(data, job.with_suffix(".frd"))
+def prepare(data):
+    """The program, and a solve."""
+    job = Path(tempfile.mkdtemp()) / "job"
+    job.with_suffix(".inp").write_text(deck(data))
+
+    def once():
+        steps = solved(job).count(" iteration ")
+        return *on_contact(data, job.with_suffix(".frd")), data["points"].size, steps
+
     version = subprocess.run(["ccx", "-v"], capture_output=True, text=True).stdout.split()[-1]
-    write(argv[1], f"CalculiX {version}", run, data["points"].size, steps)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+    return f"CalculiX {version}", once

@@ -1,18 +1,13 @@
 """GetFEM: integral contact with a rigid obstacle, augmented Lagrangian (Alart's and Curnier's).
 
-    benchmarks/peers/run python3 benchmarks/peers/getfem_hertz.py MESH.npz FILE.json [r]
-
 Newton's method on displacements and multipliers at once, with MUMPS, from a rigid shift in which
 the surfaces overlap where they will touch. Displacements of the mesh's order, multipliers of
 degree 1 on the contact surface; r times E/a is the augmentation parameter.
 """
 
-import sys
-
 import getfem as gf
 import numpy as np
 from getfem_body import Body
-from judged import best, length, write
 
 TOP = 2
 RESIDUAL = 1e-6  # over the load
@@ -36,7 +31,7 @@ def solve(data, body, r):
     x, _, across = body.begin(**numbers, r=r * E / a)
     model = body.model
     model.add_isotropic_linearized_elasticity_brick(body.im, "u", "lambda", "mu")
-    model.add_initialized_data("traction", [0.0, -float(data["load"]) / length(data)])
+    model.add_initialized_data("traction", [0.0, -float(data["traction"])])
     model.add_source_term_brick(body.im, "u", "traction", TOP)
     # the axis does not move to the side: no force is needed for that
     body.hold(np.flatnonzero((np.abs(x) < 1e-9 * np.abs(x).max()) & ~across))
@@ -46,13 +41,7 @@ def solve(data, body, r):
     return places, -model.variable("pressure"), len(x) + len(places), steps
 
 
-def main(argv):
-    """Solve, and write the pressure with what it took; the mesh is read before."""
-    data = np.load(argv[0])
-    body, r = body_of(data), float(argv[2]) if len(argv) > 2 else 10.0
-    run = best(lambda: solve(data, body, r))
-    write(argv[1], f"GetFEM {gf.getfem_env('version')}", run, *run["found"][2:])
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+def prepare(data, r=10.0):
+    """The program, and a solve."""
+    body = body_of(data)
+    return f"GetFEM {gf.getfem_env('version')}", lambda: solve(data, body, r)

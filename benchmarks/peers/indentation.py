@@ -1,19 +1,16 @@
-#!/usr/bin/env python3
 """Seconds to a force in plasticity beside GetFEM and CalculiX: a wheel pressed into a block.
 
-    python3 benchmarks/peers/indentation.py [--quick] [--output DIR]      (not inside of ./run)
+    python3 benchmarks/peers/compare.py indentation      (not inside of ./run)
 
 J2 plasticity with linear hardening, small strain, plane strain, degree 2: a rigid parabola pressed
-into half of a block, clamped below, in eight steps; meshes that get finer, the same for all, in
-turns. Seconds are as in pressed_disc.py; reading its deck is in CalculiX'. GetFEM: its brick with
-return mapping, contact as in getfem_hertz.py; CalculiX: penalty as in calculix_hertz.py, 1000 E/a.
+into half of a block, clamped below, in eight steps. GetFEM: its brick with return mapping, contact
+as in getfem_hertz.py; CalculiX: penalty as in calculix_hertz.py, 1000 E/a.
 """
 
 import tempfile
 from pathlib import Path
 
-from compare import NAME
-from forces import main
+from compare import NAME, ByForce, facets_on
 
 R, DEPTH, STEPS = 10.0, 0.002, 8
 E, NU, STRENGTH, HARDENING = 1.0, 0.3, 0.001, 0.05
@@ -81,7 +78,6 @@ def getfem(points, cells, r=1.0):
     import getfem as gf
     import numpy as np
     from getfem_body import Body
-    from judged import facets_on
 
     body = Body(points[cells], facets_on(np.isclose(points[:, 1], 0.0)[cells]))
     numbers = {"mu": E / 2 / (1 + NU), "lambda": E * NU / (1 + NU) / (1 - 2 * NU), "H_k": 0.0}
@@ -116,7 +112,6 @@ def deck(points, cells, slope=1e3):
     """The input of CalculiX, and its unknowns; the wheel is one element, all of it prescribed."""
     import numpy as np
     from calculix_hertz import begin, rows
-    from judged import facets_on
 
     edges = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     ends, middle = np.unique(edges, axis=0, return_inverse=True)
@@ -165,7 +160,6 @@ def calculix(points, cells):
 
 
 SIZES = (4, 8, 16, 24)  # elements of equal size near the wheel
-PROGRAMS = {NAME: ours, "GetFEM": getfem, "CalculiX": calculix}
-
-if __name__ == "__main__":
-    main(__file__, __doc__, "indentation", SIZES, block, PROGRAMS)
+SCENE = ByForce(
+    "indentation", "indentation", SIZES, block, {NAME: ours, "GetFEM": getfem, "CalculiX": calculix}
+)

@@ -1,17 +1,13 @@
-#!/usr/bin/env python3
 """Seconds to a force in finite strain beside GetFEM: a half disc of rubber pressed on a plane.
 
-    python3 benchmarks/peers/pressed_disc.py [--quick] [--output DIR]      (not inside of ./run)
+    python3 benchmarks/peers/compare.py pressed_disc      (not inside of ./run)
 
 The same energy (neo-Hooke, ν = 0.3), degree 2, half of the half disc, its flat side clamped and
-pressed by 0.3 R in six steps; meshes that get finer, the same for both, in turns. Seconds are those
-of the processor, the best of a few if short, for set-up and all steps; start, imports and compiled
-forms are left out. GetFEM: as getfem_hertz.py; its distance to the plane is that of X, which makes
-contact with a plane exact in finite strain. DIR/pressed_disc.md and .json have the tables.
+pressed by 0.3 R in six steps. GetFEM: as getfem_hertz.py; its distance to the plane is that of X,
+which makes contact with a plane exact in finite strain.
 """
 
-from compare import NAME
-from forces import main
+from compare import NAME, ByForce, facets_on
 
 DEPTHS = [0.05 * k for k in range(1, 7)]
 E, NU = 1.0, 0.3
@@ -80,7 +76,6 @@ def getfem(points, cells, r=10.0):
     """The same by GetFEM; in benchmarks/peers/run."""
     import numpy as np
     from getfem_body import Body
-    from judged import facets_on
 
     on_arc = np.isclose(np.linalg.norm(points - [0.0, 1.0], axis=1), 1.0)
     body = Body(points[cells], facets_on(on_arc[cells]))
@@ -106,7 +101,6 @@ def getfem(points, cells, r=10.0):
 
 
 SIZES = (8, 16, 32, 64)  # elements along the radius
-PROGRAMS = {NAME: ours, "GetFEM": getfem}
-
-if __name__ == "__main__":
-    main(__file__, __doc__, "pressed half disc", SIZES, quarter_disc, PROGRAMS)
+SCENE = ByForce(
+    "pressed_disc", "pressed half disc", SIZES, quarter_disc, {NAME: ours, "GetFEM": getfem}
+)

@@ -1,0 +1,143 @@
+"""Seconds to an error of the pressure of Hertz's half cylinder on a rigid plane.
+
+    python3 benchmarks/peers/compare.py half_cylinder      (not inside of ./run)
+
+Each program reads points, cells counterclockwise, facets of the surfaces with their cells, nodes on
+the axis, and the data of the scene from a file. This package solves a case of
+benchmarks/time_against_error.py.
+"""
+
+import importlib
+import json
+
+from compare import MESH, NAME, OURS, ROOT, command
+
+SIZES = {1: (6, 12, 24, 48), 2: (3, 6, 12, 24)}  # elements along a, by the order of the mesh
+PEERS = {"GetFEM": (1, 2), "CalculiX": (1, 2), "Kratos": (1,)}  # orders of meshes
+
+
+def mesh(size, order, file):
+    """Mesh the scene and write it; in ./run."""
+    import gmsh
+    import numpy as np
+
+    from benchmarks.error_scenes import GRADED, LINE, NU, SCENES, R
+    from meshes.tools import element_options
+
+    def group(dim, name):
+        """Nodes of the elements of a physical group."""
+        groups = gmsh.model.getPhysicalGroups(dim)
+        (tag,) = (tag for _, tag in groups if gmsh.model.getPhysicalName(dim, tag) == name)
+        found = []
+        for entity in gmsh.model.getEntitiesForPhysicalGroup(dim, tag):
+            (kind,), _, (nodes,) = gmsh.model.mesh.getElements(dim, entity)
+            nodes_each = gmsh.model.mesh.getElementProperties(kind)[3]
+            found.append(nodes.reshape(-1, nodes_each).astype(np.int64))
+        return np.concatenate(found)
+
+    with element_options(ElementOrder=order):
+        SCENES["half cylinder"]().build(size, GRADED)
+    tags, coordinates, _ = gmsh.model.mesh.getNodes()
+    cells = group(2, "body")
+    used = np.unique(cells)
+    number, place = np.zeros((2, int(tags.max()) + 1), dtype=np.int64)
+    number[used], place[tags.astype(np.int64)] = np.arange(len(used)), np.arange(len(tags))
+    cells, points = number[cells], coordinates.reshape(-1, 3)[place[used], :2]
+    p, q, r = points[cells[:, :3]].transpose(1, 2, 0)
+    turned = (q - p)[0] * (r - p)[1] < (q - p)[1] * (r - p)[0]
+    mirrored = [1, 0, 2] if order == 1 else [1, 0, 2, 3, 5, 4]
+    cells = np.where(turned[:, None], cells[:, mirrored], cells)
+    found = {"points": points, "cells": cells, "order": order, "axis": number[group(1, "axis")]}
+    # edges by the corners opposite of them, as they lie in their cells
+    edges = np.stack([cells[:, [1, 2]], cells[:, [2, 0]], cells[:, [0, 1]]], axis=1)
+    keys = np.sort(edges, axis=2) @ [len(points), 1]
+    order_of_keys = np.argsort(keys, axis=None)
+    for surface in ("contact", "top"):
+        facets = number[group(1, surface)]
+        key = np.sort(facets[:, :2], axis=1) @ [len(points), 1]
+        at = order_of_keys[np.searchsorted(keys.ravel(), key, sorter=order_of_keys)]
+        found[f"{surface} cells"] = np.stack(np.divmod(at, 3), axis=1)
+        found[surface] = np.hstack((edges.reshape(-1, 2)[at], facets[:, 2:]))
+    ends = points[found["top"][:, :2]]
+    traction = LINE.load / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
+    data = {"load": LINE.load, "a": LINE.half_width, "R": R, "E": 1.0, "nu": NU}
+    np.savez(file, **found, **data, traction=traction)
+
+
+class ByPressure:
+    """The scene, judged by its pressure."""
+
+    DOCUMENT, TITLE, MEASURE = "peers", "half cylinder", "pressure"
+
+    def prepare(self, program, case, file):
+        """A solve of a case by a program, or its mesh."""
+        import numpy as np
+
+        size, order = case
+        place = file.parent / f"{order}_{size}.npz"
+        if program == MESH:
+            mesh(size, order, place)
+            return dict
+        own = importlib.import_module(f"{program.lower()}_hertz")
+        name, solve = own.prepare(dict(np.load(place)))
+
+        def found():
+            x, pressure, unknowns, steps = solve()
+            made = {"program": name, "unknowns": unknowns, "steps": steps}
+            return {**made, "points": list(map(float, x)), "values": list(map(float, pressure))}
+
+        return found
+
+    def commands(self, folder, quick):
+        """What is run, as words for the screen, a command, and the file that it writes."""
+
+        def ours(size, order, file, **other):
+            words = {"scene": self.TITLE, "sizes": [size], "degree": order, "order": order}
+            case = json.dumps({**words, "processor": True, **other})
+            program = [str(ROOT / "benchmarks/time_against_error.py"), "--worker"]
+            return [*OURS, *program, case, str(file), str(folder / "stresses.npz")]
+
+        if not (reference := folder / "reference.json").exists():
+            yield "reference", ours(12 if quick else 64, 2, reference, rtol=1e-7), None
+        for order, along in ({1: (6,), 2: (3,)} if quick else SIZES).items():
+            for size in along:
+                peers = [peer for peer, orders in PEERS.items() if order in orders]
+                for program in (MESH, NAME, *peers):
+                    file = folder / f"{order}_{size}_{program}.json"
+                    words = command("half_cylinder", program, (size, order), file)
+                    words = ours(size, order, file) if program == NAME else words
+                    label = f"order {order}, {size} elements along a, {program}"
+                    yield label, words, None if program == MESH else file
+
+    def judged(self, folder):
+        """Rows of meshes and programs that did not fail, and those of each program by order."""
+        import numpy as np
+
+        from benchmarks.error_scenes import SCENES
+        from benchmarks.pressures import errors
+
+        samples, rows, lines = SCENES[self.TITLE]().samples, [], {}
+        (reference,) = json.loads((folder / "reference.json").read_text())["rows"]
+        for file in folder.glob("[12]_*_*.json"):
+            order, size, program = file.stem.split("_", 2)
+            found = json.loads(file.read_text())
+            if "failed" in found or program == MESH:
+                continue
+            if program == NAME:
+                (found,) = found["rows"]
+                found |= {"program": NAME, "steps": found["F"]}
+                profile = np.array(found["profile"])
+            else:
+                places = np.array(found["points"])[:, None]
+                profile = samples.at(places, np.array(found["values"]))
+            shown = ("program", "unknowns", "steps", "seconds", "MB")
+            against = errors(samples, profile, np.array(reference["profile"]))
+            row = {"order": int(order), "size": int(size), **against}
+            rows.append({**{key: found[key] for key in shown}, **row})
+        rows.sort(key=lambda r: (r["program"] != NAME, r["program"], r["order"], r["size"]))
+        for row in rows:
+            lines.setdefault(row["program"], {}).setdefault(row["order"], []).append(row)
+        return rows, {program: list(own.values()) for program, own in lines.items()}
+
+
+SCENE = ByPressure()
