@@ -1,18 +1,26 @@
-"""Conditions of a scene on the untorn mesh: N u ≤ gap, slips T u, and what friction bears."""
+"""Conditions of a scene on the untorn mesh, written anew: N u ≤ gap, slips T u, friction's bounds.
+
+Nothing is shared with the package but the definition (docs/theory.md): on what is covered of a
+secondary facet ψ = D M⁻¹φ, and n·(u_i − Σ_j ∫ψ_i φ_j u_j / ∫φ_i) ≤ the distance of the planes. At
+walls conditions are nodal, but of degree 2 Σ_k ∫ψ_i N_k u_k / ∫φ_i takes the place of u_i.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import basix
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array, eye_array, vstack
 
-from benchmarks.stress.mortar import Facet, mortar
 from benchmarks.stress.scene import Scene, Side, wall_distance
 
-# weights of nodes, normal, gap, ∫φ over what is covered, law of friction
-Condition = tuple[dict[int, float], np.ndarray, float, float, tuple[str, float] | None]
+HARDLY_COVERED = 1e-6  # of a node's ∫φ_i: no condition, docs/theory.md
+SLIVER = 1e-13  # of a facet's area: nothing is shared
+
+# weights of nodes (c × n), normals (c × gdim), gaps, ∫φ over what is covered, law of friction
+Block = tuple[csr_array, np.ndarray, np.ndarray, np.ndarray, tuple[str, float] | None]
 # vertices and all nodes of each facet of a side
 FacetsOf = Callable[[Side], tuple[np.ndarray, np.ndarray]]
 
@@ -34,112 +42,188 @@ class Conditions:
 
 
 def conditions(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Conditions:
-    """The conditions: at vertices of walls, for degree 2 with dual hats, and of pairs by mortar.
+    """The conditions: at vertices of walls, and of pairs by mortar.
 
     Args:
         scene: The scene.
         x: Nodes, shape ``(n, 3)``.
         facets_of: Vertices and nodes of a side's facets.
     """
-    found = list(_conditions(scene, x, facets_of))
-    gdim, laws = scene.gdim, [condition[4] or ("", 0.0) for condition in found]
-    area = np.array([condition[3] for condition in found])
-    bounds = [
-        np.array([value if law == kind else 0.0 for law, value in laws])
-        for kind in ("tresca", "coulomb")
-    ]
-    frames = [_frame(normal[:gdim]) for _, normal, *_ in found]
-    N = _rows([w for w, *_ in found], [frame[:1] for frame in frames], len(x) * gdim, gdim)
-    T = _rows([w for w, *_ in found], [frame[1:] for frame in frames], len(x) * gdim, gdim)
-    gap = np.array([condition[2] for condition in found])
-    return Conditions(N, T, gap, bounds[0] * area, bounds[1])
+    found = [*_at_walls(scene, x, facets_of), *_of_pairs(scene, x, facets_of)]
+    if not found:
+        none, rows = np.zeros(0), csr_array((0, len(x) * scene.gdim))
+        return Conditions(rows, rows, none, none, none)
+    weights, normals, gaps, areas, laws = zip(*found, strict=True)
+    W = vstack(weights, format="csr")
+    # the normal, and tangents that are orthonormal to it
+    frames = np.linalg.svd(np.concatenate(normals)[:, None])[2]
+    frames[:, 0] = np.concatenate(normals)
+    bounds = np.zeros((2, W.shape[0]))
+    for kind, bound in zip(("tresca", "coulomb"), bounds, strict=True):
+        values = [law[1] if law and law[0] == kind else 0.0 for law in laws]
+        bound[:] = np.repeat(values, [len(gap) for gap in gaps])
+    N, T = _rows(W, frames[:, :1]), _rows(W, frames[:, 1:])
+    return Conditions(N, T, np.concatenate(gaps), bounds[0] * np.concatenate(areas), bounds[1])
 
 
-def _conditions(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Condition]:
+def _at_walls(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Block]:
     for wall in scene.walls:
         vertices, nodes = facets_of(wall.side)
-        weights = _weights(x, vertices, nodes, scene.gdim)
-        at = sorted(weights)
+        area, M = np.zeros(len(x)), csr_array((len(x), len(x)))
+        for own in zip(vertices, nodes, strict=True):  # each in its own plane
+            first = x[own[0][0]]
+            basis = np.linalg.qr((x[own[0][1 : scene.gdim]] - first).T)[0]
+            facet, every = (Facet(of, (x[of] - first) @ basis, len(own[0])) for of in own)
+            parts = mortar([facet], [every], len(x))
+            area, M = area + parts[0], M + parts[1]
+        at = np.flatnonzero(area)
+        W = eye_array(len(x), format="csr")[at]
+        if scene.order == 2:
+            W = csr_array(diags_array(1.0 / area[at]) @ M[at])
         distance, gradient = wall_distance(wall, x[at].T)
         length = np.linalg.norm(gradient, axis=0)
-        for k, i in enumerate(at):
-            own, area = weights[i]
-            own = own if scene.order == 2 else {i: 1.0}
-            yield own, -gradient[:, k] / length[k], distance[k] / length[k], area, wall.friction
+        normals = -(gradient / length).T[:, : scene.gdim]
+        yield W, normals, distance / length, area[at], wall.friction
+
+
+def _of_pairs(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Block]:
     for pair in scene.pairs:
-        axis, end = pair.secondary[1:]
-        across = [c for c in range(scene.gdim) if c != axis]
-        sides = [facets_of(side)[0] for side in (pair.secondary, pair.primary)]
-        D, M = mortar(*([Facet(n, x[n][:, across]) for n in nodes] for nodes in sides))
+        _, axis, end = pair.secondary
         sign = 1.0 if end else -1.0
-        at = [
-            (b.low, b.high)[side[2]][axis]
-            for side in (pair.secondary, pair.primary)
-            for b in [scene.bodies[side[0]]]
-        ]
-        normal, gap = sign * np.eye(3)[axis], sign * (at[1] - at[0])
-        parts: dict[int, dict[int, float]] = {i: {i: 1.0} for i in D}
-        for (i, j), m in M.items():
-            if i in D:
-                parts[i][j] = -m / D[i]
-        for i, own in parts.items():
-            yield own, normal, gap, D[i], pair.friction
+        across = [c for c in range(scene.gdim) if c != axis]
+        facets, at = [], []
+        for side in (pair.secondary, pair.primary):
+            facets.append([Facet(n, x[n][:, across], len(n)) for n in facets_of(side)[0]])
+            box = scene.bodies[side[0]]
+            at.append((box.low, box.high)[side[2]][axis])
+        area, M = mortar(*facets, len(x))
+        met = np.flatnonzero(area)
+        W = eye_array(len(x), format="csr")[met] - diags_array(1.0 / area[met]) @ M[met]
+        normals = np.tile(sign * np.eye(scene.gdim)[axis], (len(met), 1))
+        yield (
+            csr_array(W),
+            normals,
+            np.full(len(met), sign * (at[1] - at[0])),
+            area[met],
+            pair.friction,
+        )
 
 
-def _weights(
-    x: np.ndarray, vertices: np.ndarray, nodes: np.ndarray, gdim: int
-) -> dict[int, tuple[dict[int, float], float]]:
-    """∫ψ_i N_k / ∫φ_i of the nodes k, and ∫φ_i, ψ_i dual to the hats φ_i of the vertices."""
-    sums: dict[int, dict[int, float]] = {}
-    area: dict[int, float] = {}
-    for own, every in zip(vertices, nodes, strict=True):
-        basis = np.linalg.qr((x[own[1:gdim]] - x[own[0]]).T)[0].T
-        facet = Facet(own, (x[own] - x[own[0]]) @ basis.T)
-        y, w = facet.rule(facet.polygon)
-        phi = facet.hats(y)
-        d = w @ phi
-        dual = d[:, None] * np.linalg.solve((phi * w[:, None]).T @ phi, phi.T)
-        values = _quadratic((x[every] - x[own[0]]) @ basis.T, y, len(own))
-        for i, row, part in zip(facet.nodes, (dual * w) @ values, d, strict=True):
-            area[i] = area.get(i, 0.0) + part
-            mine = sums.setdefault(i, {})
-            for k, value in zip(every, row, strict=True):
-                mine[int(k)] = mine.get(int(k), 0.0) + value
-    return {i: ({k: v / area[i] for k, v in sums[i].items()}, area[i]) for i in sums}
-
-
-def _quadratic(at: np.ndarray, y: np.ndarray, corners: int) -> np.ndarray:
-    """Shape functions of a facet's nodes at points: as many as there are nodes."""
-    degree = 1 if len(at) == corners else 2
-    scale = np.ptp(at, axis=0)
-    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1)]
-    if at.shape[1] == 1:
-        powers = [(i, 0) for i in range(degree + 1)]
-    elif corners == 3:
-        powers = [(i, j) for i, j in powers if i + j <= degree]
-
-    def monomials(z: np.ndarray) -> np.ndarray:
-        z = np.pad(z / scale, ((0, 0), (0, 2 - z.shape[1])), constant_values=1.0)
-        return np.stack([z[:, 0] ** i * z[:, 1] ** j for i, j in powers], axis=1)
-
-    return monomials(y) @ np.linalg.inv(monomials(at))
-
-
-def _frame(normal: np.ndarray) -> np.ndarray:
-    """The normal, and tangents that are orthonormal to it."""
-    _, _, Vt = np.linalg.svd(normal[None])
-    return np.concatenate((normal[None], Vt[1:]))
-
-
-def _rows(weights: list[dict[int, float]], axes: list[np.ndarray], n: int, gdim: int) -> csr_array:
-    rows, columns, values, count = [], [], [], 0
-    for own, directions in zip(weights, axes, strict=True):
-        for direction in directions:
-            for node, weight in own.items():
-                rows += [count] * gdim
-                columns += range(node * gdim, (node + 1) * gdim)
-                values += list(weight * direction)
-            count += 1
-    found = csr_array((values, (rows, columns)), shape=(count, n))
+def _rows(W: csr_array, axes: np.ndarray) -> csr_array:
+    """Rows Σ_j w_ij a·u_j along the axes a of each condition, shape ``(c, k, gdim)``."""
+    (_, count, gdim), (row, node) = axes.shape, (W := W.tocoo()).coords
+    values = W.data[:, None, None] * axes[row]
+    rows = row[:, None, None] * count + np.arange(count)[:, None]
+    columns = node[:, None, None] * gdim + np.arange(gdim)
+    places = [np.broadcast_to(part, values.shape).ravel() for part in (rows, columns)]
+    found = csr_array((values.ravel(), tuple(places)), shape=(len(axes) * count, W.shape[1] * gdim))
     found.eliminate_zeros()
     return found
+
+
+def mortar(secondary: list[Facet], primary: list[Facet], size: int) -> tuple[np.ndarray, csr_array]:
+    """∫φ_i over the covered part, and ∫ψ_i φ_j.
+
+    Args:
+        secondary: Facets of the side that carries the multipliers.
+        primary: Facets of the other side.
+        size: Number of nodes.
+
+    Returns:
+        ∫φ_i of each node, 0 of those without a condition, ∫ψ_i φ_j of nodes i, j.
+    """
+    covered, whole = np.zeros((2, size))
+    entries = list[np.ndarray]()
+    for s in secondary:
+        y, w = s.rule(s.polygon)
+        whole[s.nodes] += w @ s.hats(y)
+        shared = [(p, *s.rule(s.clip(p))) for p in primary if s.near(p)]
+        shared = [(p, y, w) for p, y, w in shared if w.sum() > SLIVER * s.area]
+        if not shared:
+            continue
+        y, w = (np.concatenate([part[k] for part in shared]) for k in (1, 2))
+        phi = s.hats(y)
+        d = w @ phi
+        covered[s.nodes] += d
+        psi_of_phi = d[:, None] * np.linalg.inv((phi * w[:, None]).T @ phi)
+        for p, y, w in shared:
+            m = psi_of_phi @ (s.hats(y) * w[:, None]).T @ p.hats(y)
+            i, j = np.meshgrid(s.nodes, p.nodes, indexing="ij")
+            entries.append(np.stack((m, i, j)).reshape(3, -1))
+    covered[covered <= HARDLY_COVERED * whole] = 0.0
+    m, i, j = np.concatenate(entries, axis=1) if entries else np.zeros((3, 0))
+    return covered, csr_array((m, (i.astype(int), j.astype(int))), shape=(size, size))
+
+
+class Facet:
+    """An edge of a line, or a triangle or an upright rectangle of a plane.
+
+    Args:
+        nodes: Numbers of its nodes, the vertices first.
+        x: Their places, shape ``(v, 1)`` or ``(v, 2)``.
+        corners: Number of vertices.
+    """
+
+    def __init__(self, nodes: np.ndarray, x: np.ndarray, corners: int) -> None:
+        self.nodes, vertices = nodes, x[:corners]
+        self.low, self.high = vertices.min(axis=0), vertices.max(axis=0)
+        self._origin, dim = x[0], x.shape[1]
+        self._inverse = np.linalg.inv((x[1 : dim + 1] - x[0]).T)
+        order = range(corners)
+        if dim == 2:
+            away = (vertices - vertices.mean(axis=0)) / (self.high - self.low)
+            order = np.argsort(np.arctan2(*away.T[::-1]))
+        self.polygon = vertices[list(order)]
+        cell = {2: "interval", 3: "triangle", 4: "quadrilateral"}[corners]
+        variant = basix.LagrangeVariant.equispaced
+        family, kind = basix.ElementFamily.P, basix.CellType[cell]
+        self._element = basix.create_element(family, kind, 1 if len(x) == corners else 2, variant)
+        self._to_nodes = np.linalg.inv(self._shapes(x))
+        self.area = self.rule(self.polygon)[1].sum()
+
+    def _shapes(self, y: np.ndarray) -> np.ndarray:
+        return self._element.tabulate(0, (y - self._origin) @ self._inverse.T)[0, :, :, 0]
+
+    def hats(self, y: np.ndarray) -> np.ndarray:
+        """Shape functions of the nodes at points, shape ``(q, v)``."""
+        return self._shapes(y) @ self._to_nodes
+
+    def near(self, other: Facet) -> bool:
+        """Whether the boxes of the facets overlap."""
+        return bool(np.all((self.low < other.high) & (other.low < self.high)))
+
+    def clip(self, other: Facet) -> np.ndarray:
+        """What both facets have in common, a convex polygon or an interval."""
+        if len(self.low) == 1:
+            return np.array([np.maximum(self.low, other.low), np.minimum(self.high, other.high)])
+        polygon = self.polygon
+        for a, b in zip(other.polygon, np.roll(other.polygon, -1, axis=0), strict=True):
+            polygon = _cut(polygon, a, b - a)
+        return polygon
+
+    def rule(self, polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points and weights that integrate polynomials of degree 6 over a convex polygon."""
+        if len(self.low) == 1:
+            xi, w = basix.make_quadrature(basix.CellType.interval, 6)
+            return polygon[0] + xi * (polygon[1] - polygon[0]), w * abs(polygon[1] - polygon[0])
+        if len(polygon) < 3:
+            return np.empty((0, 2)), np.empty(0)
+        xi, w = basix.make_quadrature(basix.CellType.triangle, 6)
+        a, b, c = polygon[0], polygon[1:-1], polygon[2:]
+        points = a + xi[:, :1, None] * (b - a)[:, None].swapaxes(0, 1)
+        points = points + xi[:, 1:, None] * (c - a)[:, None].swapaxes(0, 1)
+        area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+        return points.reshape(-1, 2), (w[:, None] * area).ravel()
+
+
+def _cut(polygon: np.ndarray, a: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """The part of a polygon to the left of a line."""
+    side = along[0] * (polygon - a)[:, 1] - along[1] * (polygon - a)[:, 0] if len(polygon) else []
+    out = []
+    for k in range(len(polygon)):
+        p, q, s, t = polygon[k - 1], polygon[k], side[k - 1], side[k]
+        if (s < 0.0) != (t < 0.0):
+            out.append(p + (q - p) * (s / (s - t)))
+        if t >= 0.0:
+            out.append(q)
+    return np.array(out).reshape(-1, 2)
