@@ -9,11 +9,11 @@ import ufl
 from bodies import held, stacked
 from dolfinx import fem
 from full_disk import clear, fill, left_in
-from reference.nonlinear import neo_hooke
 from scenes import largest, unknowns
 from sheared import Driven
 
 import tfeti_dolfinx as tfeti
+from benchmarks.stress.laws import neo_hooke
 
 TIMES = [0.5, 1.0]
 LATER = [*TIMES, 1.5]

@@ -7,10 +7,10 @@ from bodies import boxes, held
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from reference.nonlinear import neo_hooke
 from scenes import accepted, clamp, integral, unknowns
 
 import tfeti_dolfinx as tfeti
+from benchmarks.stress.laws import neo_hooke
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 
 E, NU = 1.0, 0.3

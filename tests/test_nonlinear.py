@@ -5,17 +5,11 @@ import pytest
 import ufl
 from bodies import held, stacked
 from dolfinx import fem
-from reference.nonlinear import (
-    SimplePlasticity,
-    above_plane,
-    block,
-    by_dolfinx,
-    nearest_nodes,
-    neo_hooke,
-)
+from reference.nonlinear import above_plane, block, by_dolfinx, nearest_nodes
 from scenes import accepted, clamp, decomposed, integral, largest, unknowns
 
 import tfeti_dolfinx as tfeti
+from benchmarks.stress.laws import SimplePlasticity, neo_hooke
 from tfeti_dolfinx.nonlinear.state import InternalVariables
 
 E, NU = 1.0, 0.3

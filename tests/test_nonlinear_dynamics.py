@@ -8,10 +8,11 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from moving import Thrown
 from mpi4py import MPI
-from reference.nonlinear import block, by_dolfinx, nearest_nodes, neo_hooke
+from reference.nonlinear import block, by_dolfinx, nearest_nodes
 from scenes import accepted, decomposed, hooke, largest, strain, unknowns
 
 import tfeti_dolfinx as tfeti
+from benchmarks.stress.laws import neo_hooke
 
 E, NU, RHO = 1.0, 0.3, 1.0
 DX = {"metadata": {"quadrature_degree": 4}}

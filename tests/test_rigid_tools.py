@@ -8,10 +8,10 @@ import ufl
 from bodies import held
 from dolfinx import fem
 from panels import SPACE, polygon
-from reference.nonlinear import neo_hooke
 from scenes import accepted, apart, clamp, decomposed, hooke, largest, strain, vectors
 
 import tfeti_dolfinx as tfeti
+from benchmarks.stress.laws import neo_hooke
 from tfeti_dolfinx.contact.rigid_body import Pose, motion_fields
 
 CELLS = {2: "triangle", 3: "tetrahedron"}

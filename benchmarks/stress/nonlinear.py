@@ -19,7 +19,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import basix.ufl
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -28,10 +27,10 @@ from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress import meshes
+from benchmarks.stress.laws import SimplePlasticity, deformation, neo_hooke, st_venant
 from benchmarks.stress.scene import GDIM, Body, side_name
 from benchmarks.stress.scene import Scene as Boxes
 from benchmarks.tools import limited, over_seeds, wrong
-from tfeti_dolfinx.common.compat import interpolation_points
 
 RTOL = 1e-7  # of the package
 RESIDUAL, GAP, SLIP = 1e-5, 1e-5, 1e-4  # of stiffness times displacement, and of displacement
@@ -128,102 +127,16 @@ def blocks(scene: Scene) -> tuple[dmesh.Mesh, Any, dict[str, int]]:
     return mesh, tags, {name: boxes.surfaces[side_name(side)] for name, side in names.items()}
 
 
-# --- Laws -------------------------------------------------------------------------------------
-
-
-@dataclass
-class Law:
-    """Residual of a displacement on a mesh, and what has to be done at the end of a step."""
-
-    residual: Any
-    J: Any = None
-    state: Any = None
-    update: Callable[[], None] | None = None
-    commit: Callable[[], None] | None = None
-
-
-def _gradient(u: Any) -> Any:
-    g = ufl.grad(u)
-    if len(u) == 3:
-        return g
-    return ufl.as_matrix([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
-
-
-def lame(mesh: dmesh.Mesh, nu: float) -> tuple[Any, Any]:
-    """μ and λ of E = 1."""
-    return fem.Constant(mesh, 0.5 / (1 + nu)), fem.Constant(mesh, nu / (1 + nu) / (1 - 2 * nu))
-
-
-def elastic_law(scene: Scene, u: fem.Function) -> Law:
-    """Laws with a potential; both sides of the comparison get the same from the user's hands."""
-    mesh = u.function_space.mesh
-    mu, lmbda = lame(mesh, scene.nu)
-    g = _gradient(u)
-    F, one = ufl.Identity(3) + g, ufl.Identity(3)
-    if scene.law == "neo-Hooke":
-        log = ufl.ln(ufl.det(F))
-        energy = mu / 2 * (ufl.tr(F.T * F) - 3) - mu * log + lmbda / 2 * log**2
-    elif scene.law == "St. Venant":
-        strain = (F.T * F - one) / 2
-        energy = mu * ufl.inner(strain, strain) + lmbda / 2 * ufl.tr(strain) ** 2
-    else:  # Hencky's: the modulus of shear falls with the strain
-        e = ufl.dev(ufl.sym(g))
-        bulk, limit = lmbda + 2 * mu / 3, 0.02
-        energy = bulk / 2 * ufl.tr(g) ** 2 + 2 * mu * limit**2 * (
-            0.8 * (ufl.sqrt(1 + ufl.inner(e, e) / limit**2) - 1) + 0.1 * ufl.inner(e, e) / limit**2
-        )
-    dx = ufl.dx(metadata={"quadrature_degree": 4})
-    return Law(ufl.derivative(energy * dx, u, ufl.TestFunction(u.function_space)))
-
-
 YIELD, HARDENING = 0.01, 0.1
+ENERGIES = {"neo-Hooke": neo_hooke, "St. Venant": st_venant, "deformation": deformation}
 
 
-def package_plasticity(scene: Scene, decomposition: tfeti.Decomposition, u: fem.Function) -> Law:
-    """The package's J2."""
-    model = "plane_strain" if scene.gdim == 2 else "3d"
-    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=scene.nu, model=model)
-    law = tfeti.J2Plasticity(elastic, u, yield_stress=YIELD, hardening=HARDENING)
-    v, w = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
-    return Law(law.residual(v), law.tangent(w, v), law.state, law.update)
-
-
-def own_plasticity(scene: Scene, u: fem.Function, degree: int) -> Law:
-    """J2 in UFL: the stress and the internal variables of a displacement."""
+def elastic_residual(scene: Scene, u: fem.Function) -> Any:
+    """Both sides of the comparison get the same law from the user's hands."""
     V = u.function_space
-    mesh = V.mesh
-    mu, lmbda = lame(mesh, scene.nu)
-    cell = mesh.basix_cell()
-    spaces = [
-        fem.functionspace(mesh, basix.ufl.quadrature_element(cell, value_shape=n, degree=degree))
-        for n in ((9,), ())
-    ]
-    plastic, p = (fem.Function(space) for space in spaces)
-    old = ufl.as_matrix([[plastic[3 * i + j] for j in range(3)] for i in range(3)])
-    strain = ufl.sym(_gradient(u))
-    s = 2 * mu * ufl.dev(strain - old)
-    q = ufl.sqrt(1.5 * ufl.inner(s, s) + 1e-26)
-    f = q - YIELD - HARDENING * p
-    dp = ufl.conditional(ufl.gt(f, 0.0), f / (3 * mu + HARDENING), 0.0)
-    stress = (lmbda + 2 * mu / 3) * ufl.tr(strain) * ufl.Identity(3) + s * (1 - 3 * mu * dp / q)
-    new = old + 1.5 * dp / q * s
-    new = ufl.as_vector([new[i, j] for i in range(3) for j in range(3)])
-    pairs = [
-        (g, fem.Expression(e, interpolation_points(W)))
-        for g, e, W in zip((plastic, p), (new, p + dp), spaces, strict=True)
-    ]
-
-    def commit() -> None:
-        found = []
-        for function, expression in pairs:
-            target = fem.Function(function.function_space)
-            target.interpolate(expression)
-            found.append(target.x.array)
-        for (function, _), values in zip(pairs, found, strict=True):
-            function.x.array[:] = values
-
-    dx = ufl.dx(domain=mesh, metadata={"quadrature_degree": degree, "quadrature_scheme": "default"})
-    return Law(ufl.inner(stress, _gradient(ufl.TestFunction(V))) * dx, commit=commit)
+    energy = ENERGIES[scene.law](u, 1.0, fem.Constant(V.mesh, scene.nu))
+    dx = ufl.dx(metadata={"quadrature_degree": 4})
+    return ufl.derivative(energy * dx, u, ufl.TestFunction(V))
 
 
 # --- The package's problem ----------------------------------------------------------------------
@@ -261,9 +174,16 @@ def posed(scene: Scene, mesh: dmesh.Mesh, tags: Any, surfaces: dict[str, int]) -
     decomposition = tfeti.decompose(mesh, scene.subdomains, facet_tags=tags, surfaces=surfaces)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
     u = fem.Function(V, name="u")
-    law = elastic_law(scene, u)
+    given: dict[str, Any] = {"petsc_options": {"rtol": RTOL}, "finite": scene.finite}
     if scene.law == "J2":
-        law = package_plasticity(scene, decomposition, u)
+        model = "plane_strain" if gdim == 2 else "3d"
+        elastic = tfeti.Elasticity(decomposition, E=1.0, nu=scene.nu, model=model)
+        law = tfeti.J2Plasticity(elastic, u, yield_stress=YIELD, hardening=HARDENING)
+        v, w = ufl.TestFunction(V), ufl.TrialFunction(V)
+        residual = law.residual(v)
+        given |= {"J": law.tangent(w, v), "state": law.state, "update": law.update}
+    else:
+        residual = elastic_residual(scene, u)
     way, force = (fem.Constant(decomposition.mesh, np.zeros(gdim)) for _ in range(2))
     bcs = []
     for name, value in (("bottom", np.zeros(gdim)), ("top", way)):
@@ -276,11 +196,8 @@ def posed(scene: Scene, mesh: dmesh.Mesh, tags: Any, surfaces: dict[str, int]) -
         if scene.kind == "force":
             way.value[-1], force.value[-1] = 0.0, to[-1]
 
-    given: dict[str, Any] = {"petsc_options": {"rtol": RTOL}, "finite": scene.finite}
-    if scene.law == "J2":
-        given |= {"J": law.J, "state": law.state, "update": law.update}
     contacts = [contact_of(scene, way, force)]
-    problem = tfeti.NonlinearContactProblem(law.residual, u, bcs, contacts, decomposition, **given)
+    problem = tfeti.NonlinearContactProblem(residual, u, bcs, contacts, decomposition, **given)
     return Run(problem, move)
 
 
@@ -315,10 +232,13 @@ class Check:
         self.scene, gdim = scene, scene.gdim
         V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
         self.u, self.x = fem.Function(V), V.tabulate_dof_coordinates()[:, :gdim]
-        self.law = elastic_law(scene, self.u)
+        self.plastic = None
         if scene.law == "J2":
-            self.law = own_plasticity(scene, self.u, 2)
-        self._form = fem.form(self.law.residual)
+            nu = fem.Constant(mesh, scene.nu)
+            self.plastic = SimplePlasticity(self.u, 1.0, nu, YIELD, HARDENING, 2)
+            self._form = fem.form(self.plastic.residual(ufl.TestFunction(V)))
+        else:
+            self._form = fem.form(elastic_residual(scene, self.u))
         nodes = {
             name: fem.locate_dofs_topological(V, gdim - 1, tags.find(tag))
             for name, tag in surfaces.items()
@@ -347,8 +267,8 @@ class Check:
             if force is not None:
                 pushed = r[self.meets[0], -1].sum()
                 found["tool"] = abs(pushed - force) / unit / RESIDUAL
-        if self.law.commit is not None:
-            self.law.commit()
+        if self.plastic is not None:
+            self.plastic.commit()
         self.before, self.tool = moved.copy(), tool.copy()
         return [f"{name} {value:.1e}" for name, value in found.items() if not value <= 1.0]
 

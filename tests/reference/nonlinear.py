@@ -2,9 +2,7 @@
 
 import inspect
 
-import basix.ufl
 import numpy as np
-import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from dolfinx.fem import petsc as fem_petsc
@@ -110,60 +108,6 @@ def nearest_nodes(V, W):
     distance, found = cKDTree(V.tabulate_dof_coordinates()).query(W.tabulate_dof_coordinates())
     assert np.all(distance < 1e-12)
     return found
-
-
-class SimplePlasticity:
-    """J2 with linear hardening, plane strain or in space, by UFL alone: the return in one form."""
-
-    def __init__(self, u, E, nu, sy, H, degree):
-        mesh = u.function_space.mesh
-        self.u, self.sy, self.H = u, sy, H
-        self.mu, self.bulk = E / 2 / (1 + nu), E / 3 / (1 - 2 * nu)
-        cell, self.gdim = mesh.basix_cell(), mesh.geometry.dim
-        self.dx = ufl.dx(
-            domain=mesh, metadata={"quadrature_degree": degree, "quadrature_scheme": "default"}
-        )
-        tensor = basix.ufl.quadrature_element(cell, value_shape=(9,), degree=degree)
-        scalar = basix.ufl.quadrature_element(cell, degree=degree)
-        self.ep = fem.Function(fem.functionspace(mesh, tensor))
-        self.p = fem.Function(fem.functionspace(mesh, scalar))
-        _, dp, n = self._returned()
-        new = self._ep() + dp * n
-        self.state = {
-            self.ep: ufl.as_vector([new[i, j] for i in range(3) for j in range(3)]),
-            self.p: self.p + dp,
-        }
-
-    def _ep(self):
-        return ufl.as_matrix([[self.ep[3 * i + j] for j in range(3)] for i in range(3)])
-
-    def strain(self, w):
-        e = ufl.sym(ufl.grad(w))
-        if self.gdim == 3:
-            return e
-        return ufl.as_matrix([[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, 0]])
-
-    def _returned(self):
-        e = self.strain(self.u)
-        s = 2 * self.mu * ufl.dev(e - self._ep())
-        q = ufl.sqrt(1.5 * ufl.inner(s, s) + 1e-24)
-        f = q - (self.sy + self.H * self.p)
-        dp = ufl.conditional(ufl.gt(f, 1e-12), f / (3 * self.mu + self.H), 0.0)
-        n = 1.5 * s / q
-        return self.bulk * ufl.tr(e) * ufl.Identity(3) + s - 2 * self.mu * dp * n, dp, n
-
-    def residual(self, v):
-        return ufl.inner(self._returned()[0], self.strain(v)) * self.dx
-
-
-def neo_hooke(u, E, nu):
-    """Energy per volume of a compressible neo-Hookean body, in plane strain or in space."""
-    g = ufl.grad(u)
-    if len(u) == 2:
-        g = ufl.as_matrix([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
-    F = ufl.Identity(3) + g
-    J, mu, lmbda = ufl.det(F), E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-    return mu / 2 * (ufl.tr(F.T * F) - 3) - mu * ufl.ln(J) + lmbda / 2 * ufl.ln(J) ** 2
 
 
 def pressed_ring(inside, outside, widened, E, nu):
