@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import runpy
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -20,9 +19,10 @@ from typing import Any
 from mpi4py import MPI
 from petsc4py import PETSc
 
+import demos
 from benchmarks.stability_scenes import LADDERS
 from benchmarks.stress.judge import run_scene
-from benchmarks.tools import ROOT, Tables, command_line, finish, say
+from benchmarks.tools import Tables, command_line, finish, say
 from tfeti_dolfinx import ContactProblem
 from tfeti_dolfinx.mesh.partition import PARTITIONERS
 from tfeti_dolfinx.options import MECHANISMS
@@ -97,12 +97,10 @@ def counted() -> Iterator[Counts]:
 def run(scene: str, without: str) -> Counts:
     """Run a demo or a rung without a mechanism; what it raises stands among the reasons."""
     name, *words = scene.split()
-    options, argv = PETSc.Options(), sys.argv
+    options, known = PETSc.Options(), PARTITIONERS["round"]
     options.setValue("-tfeti_without", without if without in MECHANISMS else "")
-    known = PARTITIONERS["round"]
     if without == "round_parts":
         PARTITIONERS["round"] = PARTITIONERS["bisection"]
-    sys.argv = [str(ROOT / "demos" / f"{name}.py"), *words]
     try:
         with counted() as counts, contextlib.redirect_stdout(io.StringIO()):
             try:
@@ -111,15 +109,12 @@ def run(scene: str, without: str) -> Counts:
                     (ladder,) = (one for one in LADDERS if one.name == title)
                     run_scene(ladder.rung(cell, float(value)), MPI.COMM_WORLD)
                 else:
-                    runpy.run_path(sys.argv[0], run_name="__main__")
-            except SystemExit:
-                pass
+                    demos.names_of(name, words)
             except Exception as error:
                 counts.reasons[type(error).__name__] += 1
     finally:
         options.delValue("-tfeti_without")
         PARTITIONERS["round"] = known
-        sys.argv = argv
     return counts
 
 

@@ -6,9 +6,9 @@ Each scene is solved on meshes that get finer, each case in processes of its own
 hand, and following the estimated error (by the demos ``adaptive_2d.py`` and ``adaptive_3d.py``);
 with displacements of degree 1 and 2, the latter on curved cells, too; with triangles and
 quadrilaterals. ``seconds`` are from gmsh's mesh to the displacement, the best of three if short;
-gmsh's own are in ``meshing``; what is paid once, the start of the program with its imports and the
-compiling of forms, has a table of its own: the coarsest mesh is solved once more at first. ``MB``
-is the peak of resident memory of all ranks.
+gmsh's own are in ``meshing``; what is paid once, for imports and the compiling of forms, is left
+out: the coarsest mesh is solved once more at first. ``MB`` is the peak of resident memory of all
+ranks.
 
 Errors are relative, against a fine solution of degree 2 of the same scene: ``energy`` is that of
 the stress in the energy norm, ``estimate`` what the solve itself says of it; ``pressure`` is the L²
@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import sys
 import tempfile
 import time
@@ -52,7 +51,6 @@ from benchmarks.tools import (
     finish,
     json_of,
     picture,
-    slope,
     write_tables,
 )
 from meshes.tools import element_options
@@ -294,18 +292,14 @@ def solved_row(case: Case, size: float, reference: Path) -> dict[str, Any]:
 
 def worker(text: str, file: str, reference: Path) -> None:
     """Solve the case of a JSON text, and write its rows. Collective."""
-    started, case, first = time.time(), Case(**json.loads(text)), None
+    case = Case(**json.loads(text))
     if case.processor:
         time.perf_counter = time.process_time
-    if reference.exists():  # the reference itself is not timed
-        solved = solve(SCENES[case.scene](), case, case.sizes[0])
-        solved.problem.destroy()
-        first = solved.seconds
+    if reference.exists():  # compiles forms; the reference itself is not timed
+        solve(SCENES[case.scene](), case, case.sizes[0]).problem.destroy()
     rows = [solved_row(case, size, reference) for size in case.sizes]
-    once = {"start": started - float(os.environ.get("LAUNCHED", started))}
-    once["first"] = first and first - rows[0]["seconds"]
     if COMM.rank == 0:
-        Path(file).write_text(json.dumps({"rows": rows, "once": once}))
+        Path(file).write_text(json.dumps({"rows": rows}))
 
 
 # --- Tables ---------------------------------------------------------------------------------------
@@ -336,15 +330,10 @@ def seconds_at(rows: Sequence[dict[str, Any]], name: str, level: float) -> float
 
 
 def summary(case: Case, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Slopes of a group of meshes, and seconds at equal errors."""
-    made: dict[str, Any] = {"meshes": case.label}
-    for name in MEASURES:
-        values = [row[name] for row in rows]
-        for over in ("unknowns", "seconds"):
-            made[f"{name}, slope over {over}"] = slope([row[over] for row in rows], values)
-        for level in LEVELS:
-            made[f"{name}, seconds to {level:.0%}"] = seconds_at(rows, name, level)
-    return made
+    """Seconds of a group of meshes at equal errors."""
+    levels = [(name, level) for name in MEASURES for level in LEVELS]
+    found = {f"{name} to {level:.0%}": seconds_at(rows, name, level) for name, level in levels}
+    return {"meshes": case.label, **found}
 
 
 def degrees(groups: dict[str, Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -372,7 +361,7 @@ def degrees(groups: dict[str, Sequence[dict[str, Any]]]) -> list[dict[str, Any]]
 def run_case(case: Case, reference: Path) -> dict[str, Any]:
     """What a case gives, solved in processes of its own."""
     words = [sys.executable, __file__, "--worker", json.dumps(asdict(case)), FILE, reference]
-    return json_of(words, case.ranks, LAUNCHED=str(time.time()))
+    return json_of(words, case.ranks)
 
 
 def study(name: str, arguments: Any, folder: Path) -> Tables:
@@ -382,7 +371,7 @@ def study(name: str, arguments: Any, folder: Path) -> Tables:
         cases = [replace(case, sizes=case.sizes[:2]) for case in cases[:2]]
         finest = replace(finest, sizes=cases[0].sizes[1:], rtol=1e-6)
     best = run_case(finest, reference)["rows"][-1]
-    rows, groups, once, by_name = [], [], [], {}
+    rows, groups, by_name = [], [], {}
     for case in cases:
         if case.ranks in arguments.ranks:
             found = run_case(replace(case, processor=arguments.processor), reference)
@@ -390,9 +379,8 @@ def study(name: str, arguments: Any, folder: Path) -> Tables:
             rows += [{"meshes": case.label, **row} for row in made]
             by_name[case.label] = made
             groups.append(summary(case, made))
-            once.append({"meshes": case.label, **found["once"]})
             print(name, *groups[-1].values(), sep=" | ", flush=True)
-    tables = {name: rows, f"{name}, slopes and seconds": groups, f"{name}, paid once": once}
+    tables = {name: rows, f"{name}, seconds to an error": groups}
     beside = degrees(by_name)
     return {**tables, f"{name}, degrees at equal seconds": beside} if beside else tables
 

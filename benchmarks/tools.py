@@ -19,7 +19,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -269,11 +268,6 @@ def write_tables(folder: Path, name: str, tables: dict[str, Sequence[dict[str, A
         partial = folder / f".{name}{suffix}.partial"
         partial.write_text(content + "\n")
         os.replace(partial, folder / f"{name}{suffix}")
-
-
-def slope(sizes: Sequence[float], errors: Sequence[float]) -> float:
-    """Order of convergence: slope of log(error) over log(size), by least squares."""
-    return float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
 
 
 @contextmanager

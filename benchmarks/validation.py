@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
@@ -100,26 +101,10 @@ def rectangle(
     low: tuple[float, float], high: tuple[float, float], cells: tuple[int, int]
 ) -> tfeti.Decomposition:
     """A rectangle of quadrilaterals: "bottom", "right", "top", "left"."""
-
-    def build() -> Any:
-        model = started_model("rectangle")
-        geo = model.geo
-        corners = (low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])
-        points = [geo.addPoint(*x, 0.0) for x in corners]
-        sides = [geo.addLine(points[k], points[(k + 1) % 4]) for k in range(4)]
-        body = geo.addPlaneSurface([geo.addCurveLoop(sides)])
-        for k, side in enumerate(sides):
-            geo.mesh.setTransfiniteCurve(side, cells[k % 2] + 1)
-        geo.mesh.setTransfiniteSurface(body)
-        geo.mesh.setRecombine(2, body)
-        geo.synchronize()
-        model.addPhysicalGroup(2, [body], name="body")
-        for name, side in zip(("bottom", "right", "top", "left"), sides, strict=True):
-            model.addPhysicalGroup(1, [side], name=name)
-        model.mesh.generate(2)
-        return model
-
-    return torn(COMM, build, subdomains=4)
+    mesh = dmesh.create_rectangle(COMM, (low, high), cells, dmesh.CellType.quadrilateral)
+    at = {"bottom": (1, low[1]), "right": (0, high[0]), "top": (1, high[1]), "left": (0, low[0])}
+    sides = {name: lambda x, k=k, c=c: np.isclose(x[k], c) for name, (k, c) in at.items()}
+    return tfeti.decompose(mesh, 4, surfaces=sides)
 
 
 def pin_in_sheet(size: float) -> Any:
