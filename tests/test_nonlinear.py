@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import held, stacked
+from bodies import boxes, held, stacked
 from dolfinx import fem
 from reference.nonlinear import above_plane, block, by_dolfinx, nearest_nodes
 from scenes import accepted, clamp, decomposed, integral, largest, unknowns
@@ -204,14 +204,9 @@ def test_stress_of_a_bar_follows_its_hardening(comm):
     saturation, rate = 0.02, 30.0
     decomposition = decomposed("tetrahedron", 2, 3)
     V, u, v, du = unknowns(decomposition)
-    law = tfeti.J2Plasticity(
-        tfeti.Elasticity(decomposition, E=E, nu=NU),
-        u,
-        yield_stress=0.01,
-        hardening=0.05,
-        saturation=saturation,
-        rate=rate,
-    )
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU)
+    numbers = {"yield_stress": 0.01, "hardening": 0.05, "saturation": saturation, "rate": rate}
+    law = tfeti.J2Plasticity(elastic, u, **numbers)
     pulled = fem.Constant(decomposition.mesh, 0.0)
     bcs = held(decomposition, "left", ("right", pulled), "front", "bottom")(V)
     given = {"J": law.tangent(du, v), "state": law.state, "update": law.update}
@@ -244,6 +239,25 @@ def test_a_step_that_did_not_converge_is_not_accepted(comm):
     assert np.all(problem.u.x.array == 0.0)
     with pytest.raises(tfeti.InputError, match="has not converged"):
         problem.accept()
+
+
+def test_a_free_body_slides_on_both_sides(comm):
+    """Between two others slips hardly tell its place: Q = μN drawn along, on, and back."""
+    sizes = (("low", 0.0, 0.0, 8), ("mid", 1.0, 1.0, 5), ("up", 0.0, 2.0, 8))
+    parts = [(name, (a, y), (4.0 - a, y + 1.0), (n, 2)) for name, a, y, n in sizes]
+    mesh, tags, names = boxes("quadrilateral", parts)
+    d = tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=names)
+    V, u, v, _ = unknowns(d)
+    law, value, mu = SimplePlasticity(u, E, NU, 0.03, 0.05, 2), fem.Constant(mesh, (0.0, 0.0)), 0.6
+    bcs = [clamp(V, d.facets("low bottom")), clamp(V, d.facets("up top"), value)]
+    pairs = (("low top", "mid bottom"), ("mid top", "up bottom"))
+    contacts = [tfeti.Contact(*pair, friction=tfeti.Coulomb(mu)) for pair in pairs]
+    problem = tfeti.NonlinearContactProblem(law.residual(v), u, bcs, contacts, d, state=law.state)
+    for along, sign in ((0.0, 0.0), (0.1, -1.0), (0.3, -1.0), (0.0, 1.0)):
+        value.value[:] = along, -0.02
+        accepted(problem)
+        for Q, N in (problem.solution.contact(i).resultant.force for i in range(2)):
+            assert abs(Q - sign * mu * N) < 1e-4 * abs(N)
 
 
 def two_blocks(degree):

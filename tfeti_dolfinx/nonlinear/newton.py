@@ -25,6 +25,9 @@ class NewtonTolerances:
             and places anew.
         loosest: Relative tolerance of a linearised problem at most; None: 0.1, in finite strain
             0.01.
+        finer: In small strain, where an increment is more than ``slow`` of the last one, the next
+            problem's tolerance is at most this share of the last one's: increments may be errors of
+            linearised problems, as of where a body is that slides on all sides.
         steepest: In small strain forcing expects the next increment to be at least this share of
             the last one: the slope along one step does not see all that is left. Nor does the end.
         flattest: And at most this: at that of a kept tangent a new one would be solved to more
@@ -64,6 +67,7 @@ class NewtonTolerances:
     safety: float = 10.0
     forcing: float | None = None
     loosest: float | None = None
+    finer: float = 0.1
     steepest: float = 0.1
     flattest: float = 0.25
     near: float = 20.0

@@ -179,6 +179,7 @@ class NonlinearContactProblem(ContactProblem):
         faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
         keeping = self._keeping
         keeping.begin()
+        before = np.inf
         self._set(self.u.x.array)  # a law's numbers, or what they depend on, may have changed
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
@@ -208,6 +209,9 @@ class NonlinearContactProblem(ContactProblem):
                 asked = float(np.clip(remainder, tol.steepest, tol.flattest)) * increment
                 left = max(tol.safety * remainder, tol.steepest) * increment
                 short |= t == 1.0 and left <= exact
+                if increment > tol.slow * before:
+                    asked = min(asked, tol.finer * rtol / self._forcing)
+            before = increment
             nothing = largest(comm, end) <= max(tol.nothing * first, self._least)
             if nothing or (short and rtol <= exact):
                 self._set(end)
