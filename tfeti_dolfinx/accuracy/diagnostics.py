@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from weakref import ref
@@ -42,7 +42,7 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     element = basix.create_element(basix.ElementFamily.P, cell, 1)
     middle = basix.geometry(cell).mean(axis=0)[None]
     slopes = element.tabulate(1, middle)[1:, 0, :, 0]
-    J = np.einsum("dv,cvg->cgd", slopes, mesh.geometry.x[corners, :gdim])
+    J = np.tensordot(mesh.geometry.x[corners, :gdim], slopes, (1, 1))
     return np.asarray(np.minimum(np.linalg.cond(J, "fro") / gdim, 1.0 / TINY))
 
 
@@ -125,10 +125,10 @@ class Diagnostics:
     def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
         """Sentences beside the ``outcome``, each of which names the thing. Collective."""
         if self._of is None or self._of() is not dual:
-            lasting = (self._cells(), self._locking(dual.subdomains), self._hinges)
+            nodes = self._points(dual.subdomains)
+            lasting = (self._cells(), self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             # mean slopes of a displacement of each subdomain, (gdim, nodes)
-            nodes = self._points(dual.subdomains)
             self._slopes = [np.linalg.pinv(own, EPSILON * len(own)) for own in nodes]
         u = solution.u
         return [
@@ -160,7 +160,7 @@ class Diagnostics:
             for (a, b), count in zip(*shared_by_bodies(self._decomposition), strict=True)
         ]
 
-    def _locking(self, subdomains: Subdomains) -> Iterator[str]:
+    def _locking(self, subdomains: Subdomains, nodes: Sequence[Array]) -> Iterator[str]:
         """Displacements of degree 1 where a material hardly changes its volume."""
         if self._dofs.V.element.basix_element.degree > 1:
             return
@@ -168,7 +168,7 @@ class Diagnostics:
             block.stiffness.stretch_over_shear
             if isinstance(block, SparseBlock)
             else stretch_over_shear(x, self._dofs.bs, block.multiply)
-            for block, x in zip(subdomains.elastic, self._points(subdomains), strict=True)
+            for block, x in zip(subdomains.elastic, nodes, strict=True)
         ]
         worst = subdomains.body_maxima([ratios])[0]
         if np.any(worst > LIMITS.locks):
@@ -263,7 +263,7 @@ class Diagnostics:
     def _points(self, subdomains: Subdomains) -> list[Array]:
         """Return points of each subdomain's nodes on this rank, from their middle on."""
         gdim, bs = self._decomposition.mesh.geometry.dim, self._dofs.bs
-        x = self._dofs.V.tabulate_dof_coordinates()[self._dofs.dolfinx_node, :gdim]
+        x = self._dofs.points()[:, :gdim]
         parts = [x[p.start // bs : p.stop // bs] for _, p in subdomains.elastic_parts]
         return [own - own.mean(axis=0) for own in parts]
 

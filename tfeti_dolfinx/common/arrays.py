@@ -166,6 +166,10 @@ class LocalMatrix:
         self._petsc.multTranspose(self._y, self._x)
         return np.array(self._x.array_r)
 
+    def is_symmetric(self, tolerance: float) -> bool:
+        """Return whether entries of A − Aᵀ are at most this large."""
+        return bool(self._petsc.isSymmetric(tolerance))
+
     def entries(self) -> Entries:
         """Return copies of its arrays."""
         indptr, indices, data = self._petsc.getValuesCSR()

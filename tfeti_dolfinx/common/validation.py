@@ -12,7 +12,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from tfeti_dolfinx.common.arrays import Array, as_petsc_matrix
+from tfeti_dolfinx.common.arrays import Array, LocalMatrix
 from tfeti_dolfinx.errors import InputError, TfetiError
 
 # --- Checks of values, types and callables ----------------------------------------------------
@@ -206,17 +206,18 @@ def check_stiffness(
     what: str = "the stiffness",
     form: str = "a linear elastic form, or the tangent of an energy",
     symmetry: float = 1e-8,
+    product: LocalMatrix | None = None,
 ) -> None:
     """Raise an InputError unless a stiffness is finite, symmetric and of a positive diagonal.
 
     Messages have its owner's name, what it is called and the form that is expected. ``symmetry`` is
     the largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far
-    below any term of a form that matters.
+    below any term of a form that matters. ``product`` is K, where it is there for products.
     """
     if not np.all(np.isfinite(K.data)):
         raise InputError(f"{name}: {what} has entries that are not finite")
     scale = np.abs(K.data).max(initial=0.0)
-    if not as_petsc_matrix(K).isSymmetric(symmetry * scale):
+    if not (LocalMatrix(K) if product is None else product).is_symmetric(symmetry * scale):
         skew = np.abs((K - K.T).data).max(initial=0.0)  # maybe on entries that Kᵀ has not
         if skew > symmetry * scale:
             raise InputError(

@@ -144,14 +144,14 @@ class Constraints:
     def jumps(self, v: Array) -> Array:
         """B v on this rank's rows, of displacements on this rank's trace. Collective."""
         trace, rows = self.B.createVecs()
-        trace.array[:] = v
+        trace.setArray(v)
         self.B.mult(trace, rows)
         return _taken(rows, trace)
 
     def forces(self, lam: Array) -> Array:
         """Bᵀλ on this rank's trace, of multipliers of this rank's rows. Collective."""
         trace, rows = self.B.createVecs()
-        rows.array[:] = lam
+        rows.setArray(lam)
         self.B.multTranspose(rows, trace)
         return _taken(trace, rows)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from numbers import Real
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -184,8 +185,10 @@ def friction_values(
     """
     if friction is None:
         return np.zeros((len(records), dofs.bs - 1))
-    x, what = group_points(dofs)[records.group], f"{name}: {friction.what}"
-    columns = []
+    x: Array = np.zeros((len(records), 3))
+    what, columns = f"{name}: {friction.what}", list[Array]()
+    if not all(isinstance(value, Real) for value in friction.values):
+        x = group_points(dofs)[records.group]
     for value in friction.values:
         if isinstance(value, fem.Function):  # the mean over torn copies
             S, dof = dofs.scalar

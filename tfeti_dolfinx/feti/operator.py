@@ -121,7 +121,7 @@ class DualOperator:
 
     def __call__(self, x: Array) -> Array:
         """B diag(A_s) Bᵀ x, from this rank's part of x to that of the product. Collective."""
-        self._x.array[:] = x
+        self._x.setArray(x)
         self.B.multTranspose(self._x, self._w)
         self.multiply(self._w.array_r, self._v.array)
         self.B.mult(self._v, self._x)

@@ -196,14 +196,14 @@ class _OnFace:
             return out
 
         def put_jumps(v: Array) -> None:  # y = B_D v
-            w.array[:] = v[:trace]
+            w.setArray(v[:trace])
             B.mult(w, y)
             if self._bends:
                 y.array[:] += self._springs @ (moves * v[size:])
 
         def without_jumps(v: Array) -> Array:  # H v
             put_jumps(v)
-            y.array[:] = solved(y.array_r)
+            y.setArray(solved(y.array_r))
             out = -lifted()
             out[:size] += v[:size] / D
             out[size:] += v[size:]
@@ -216,7 +216,7 @@ class _OnFace:
             return out
 
         # 1. the least displacement in D with the jumps x, and smooth
-        y.array[:] = solved(x)
+        y.setArray(solved(x))
         u = smoothed(on.steps, stiff, without_jumps, lifted())
         # 2. its forces A u, and back
         v = np.zeros(len(u))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +45,7 @@ class Grams:
         base.sort_indices()
         whole = plus(base, *np.divmod(reached, max(size, 1)), np.zeros(len(reached)))
         # 2. where they stand
-        self._base, self._table = whole.data, (whole.indices, whole.indptr)
+        self._base, self._like = whole.data, whole.csr()
         row = np.repeat(np.arange(size), np.diff(whole.indptr))
         self._reached = np.searchsorted(row * size + whole.indices, reached)
         self._blocks = [(rows, G, np.searchsorted(reached, pairs)) for rows, G, pairs in parts]
@@ -73,7 +74,8 @@ class Grams:
         data[self._reached] += sums[:-2]
         if damping:
             data += damping * self.whole.data
-        gram = csr_array((data, *self._table), shape=(size, size))
+        gram = copy(self._like)  # with the same pattern, which is not looked at again
+        gram.data = data
         if tangents:
             count, width = face.tangents.shape
             each = rows_of(self.Gt, face.tangent_rows.ravel(), face.tangents.ravel())

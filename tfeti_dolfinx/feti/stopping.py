@@ -281,28 +281,33 @@ class Accuracy(StoppingRule):
 
     def look(self, lam: Array, gradient: Array, face: Face, residual: float) -> None:
         """Recover the displacement of an iterate, and measure it. Collective."""
+        dual = self._dual
+        error = residual / self.norm
+        self._measure(recover(dual.constraints, dual.coarse, lam, gradient, face, error), face)
+
+    def _measure(self, state: Recovered, face: Face) -> None:
+        """Measure the displacement of an iterate. Collective."""
         before = None if self.recovered is None else self.recovered.u
-        state = recover(
-            self._dual.constraints, self._dual.coarse, lam, gradient, face, residual / self.norm
-        )
         now = measure(self._dual, state, face, self.norm, before)
         self._before = self.measures if self.looks else None
         self.recovered, self.measures, self.u = state, now, state.u
         self.looks, self.waits = self.looks + 1, False
         if self.goal is not None:
-            bound, goal = energy_bound(self._dual, lam, state.u, self.norm), self.goal(state.u)
+            bound = energy_bound(self._dual, state.lam, state.u, self.norm)
+            goal = self.goal(state.u)
             allowed = self._limits.target * max(goal, 1e-5 * now.energy)
             self.reached.append(TargetStatus(bound, goal, now.energy, allowed))
 
-    def look_again(self, lam: Array, gradient: Array, face: Face, residual: float) -> bool:
+    def look_again(self, face: Face) -> bool:
         """Measure the iterate of the last look with another set of multipliers. Collective.
 
         Bounds of friction that a solve was given are not those of its forces. What the last look
         has seen stays the least of the errors. Return whether it is right to the tolerance with
         that set, too.
         """
+        assert self.recovered is not None
         self._least = self.errors()
-        self.look(lam, gradient, face, residual)
+        self._measure(self.recovered, face)
         self._before = None
         ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self.measures.longest)
         return bool(ratio <= 1.0 or longest <= self._atol)

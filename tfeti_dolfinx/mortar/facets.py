@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any
 
 import basix
@@ -23,6 +24,7 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Lagrange elements on facets --------------------------------------------------------------
 
+create_element = cache(basix.create_element)  # each is made once
 # vertices of a facet in the order of its polygon; DOLFINx numbers quadrilaterals as tensors
 POLYGON = {"interval": [0, 1], "triangle": [0, 1, 2], "quadrilateral": [0, 1, 3, 2]}
 FACET_OF = {
@@ -42,7 +44,7 @@ class FacetElement:
     def __init__(self, facet: str, degree: int, variant: Any) -> None:
         self.facet, self.degree = facet, degree
         self._cell = getattr(basix.CellType, facet)
-        self._element = basix.create_element(basix.ElementFamily.P, self._cell, degree, variant)
+        self._element = create_element(basix.ElementFamily.P, self._cell, degree, variant)
         self.points = self._element.points
         self.size = self._element.dim
 
@@ -157,7 +159,7 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     mesh = dofs.V.mesh
     gdim, (cell, place) = mesh.geometry.dim, _cells_at(mesh, facets)
     coordinate = mesh.ufl_domain().ufl_coordinate_element()
-    of_cell = basix.create_element(
+    of_cell = create_element(
         basix.ElementFamily.P, coordinate.cell_type, coordinate.degree, coordinate.lagrange_variant
     )
     on_facet = np.array(of_cell.entity_closure_dofs[-2])[place]

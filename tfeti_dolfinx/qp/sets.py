@@ -202,7 +202,9 @@ class Product:
     """
 
     def __init__(self, factors: Sequence[tuple[slice | Array, FeasibleSet]] = ()) -> None:
-        self.factors = [(np.r_[rows], factor) for rows, factor in factors]
+        self.factors = [
+            (np.r_[rows] if isinstance(rows, slice) else rows, factor) for rows, factor in factors
+        ]
         rows = [np.empty(0, dtype=np.int64), *(rows for rows, _ in self.factors)]
         if np.any(twice := np.bincount(np.concatenate(rows)) > 1):
             raise InputError(
@@ -350,13 +352,13 @@ class Ellipses:
 
     def _level(self, t: Array) -> Array:
         """‖t/a‖, 1 on the boundary; entries that are fixed do not count."""
-        return np.asarray(np.linalg.norm(t * self._inverse, axis=1))
+        return _lengths(t * self._inverse)
 
     def _boundary(self, t: Array) -> tuple[Array, Array]:
         """Flags of what is on the boundary, and its outward normals; 0 where nothing moves."""
         on = self._level(t) >= 1.0 - ON
         steep = t * self._inverse**2
-        size = np.linalg.norm(steep, axis=1, keepdims=True)
+        size = _lengths(steep)[:, None]
         normal = np.divide(steep, size, out=np.zeros_like(t), where=size > 0.0)
         return on | ~self._moves.any(axis=1), normal
 
@@ -364,13 +366,18 @@ class Ellipses:
         """Return the nearest points of the boundary: a_j²z_j/(a_j² + μ)."""
         a = self.semi_axes[which]
         if np.all(a == a[:, :1]):  # discs and intervals
-            return np.asarray(a * (z / np.linalg.norm(z, axis=1, keepdims=True)))
+            return np.asarray(a * (z / _lengths(z)[:, None]))
         scale = np.maximum(a.max(axis=1, initial=TINY), TINY)[:, None]
         a, z = a / scale, z / scale
         y = a * a * z / np.maximum(a * a + _secular(a, z)[:, None], TINY)
         # the last rounding of μ must not leave y off the boundary
         level = np.linalg.norm(np.divide(y, a, out=np.zeros_like(y), where=a > 0.0), axis=1)
         return np.asarray(scale * y / np.maximum(level, TINY)[:, None])
+
+
+def _lengths(x: Array) -> Array:
+    """Length of each row."""
+    return np.sqrt(np.einsum("ij,ij->i", x, x))
 
 
 def _secular(a: Array, z: Array) -> Array:

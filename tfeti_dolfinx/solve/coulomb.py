@@ -291,8 +291,7 @@ class FrictionBounds:
         tells the larger errors.
         """
         self._dual.bound_friction(self._found)
-        residual = max(result.projected_gradient, result.norm * result.equality)
-        fits = rule.look_again(result.lam, result.gradient, result.face, residual)
+        fits = rule.look_again(result.face)
         self._dual.bound_friction(self.now)
         return fits
 

@@ -127,11 +127,11 @@ def fixing_nodes(x: Array, count: int) -> Array:
     rounding must not choose (Gonzalez, Theor. Comput. Sci. 38, 1985).
     """
     chosen: list[int] = []
-    distance = np.linalg.norm(x - x.mean(axis=0), axis=1)
+    square = np.einsum("ni,ni->n", y := x - x.mean(axis=0), y)
     while len(chosen) < min(count, len(x)):
-        chosen.append(int(np.argmax(distance >= (1.0 - TOLERANCES.equal) * distance.max())))
-        own = np.linalg.norm(x - x[chosen[-1]], axis=1)
-        distance = own if len(chosen) == 1 else np.minimum(distance, own)
+        chosen.append(int(np.argmax(square >= (1.0 - 2.0 * TOLERANCES.equal) * square.max())))
+        own = np.einsum("ni,ni->n", y := x - x[chosen[-1]], y)
+        square = own if len(chosen) == 1 else np.minimum(square, own)
     return np.unique(chosen)
 
 

@@ -89,7 +89,7 @@ class CholeskyFactor:
             return np.array(b)
         if b.ndim == 2:
             return of_columns(self._solved, b, len(b))
-        self._b.array[:] = b
+        self._b.setArray(b)
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
 

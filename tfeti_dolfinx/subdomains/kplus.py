@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -119,7 +120,7 @@ def gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool
     Pivots that should be 0 are positive where rounding makes them so. It takes one solve.
     """
     R = _with_weakly_held(K, R, x)
-    force = _beside(R, np.random.default_rng(0).standard_normal(K.shape[0]))
+    force = _beside(R, _noise(K.shape[0]))
     u = _beside(R, inverse.solve(force))
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
     if not lost:
@@ -131,6 +132,11 @@ def gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool
     length = np.linalg.norm(np.ptp(x, axis=0))
     fine = length > TOLERANCES.fine * edges.min(initial=np.inf)
     return not (fine or diagonal.max() > TOLERANCES.spread * diagonal.min())
+
+
+@lru_cache(64)
+def _noise(size: int) -> Array:
+    return np.random.default_rng(0).standard_normal(size)
 
 
 def _with_weakly_held(K: Any, R: Array, x: Array) -> Array:

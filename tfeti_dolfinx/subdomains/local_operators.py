@@ -29,8 +29,8 @@ class LocalChoice:
 
 
 # right sides that go through a factor at once: enough that it is not read for each, and few enough
-# that they fit beside it into the cache
-TOGETHER = 32
+# that they fit beside it into the cache; more of a short trace, so many numbers
+TOGETHER, NUMBERS = 32, 2**14
 
 # --- Groups of Blocks with one matrix ---------------------------------------------------------
 
@@ -130,10 +130,12 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """K_bb of equal subdomains, or those of subdomains without equals as one sparse matrix."""
     traces = {id(block.traced): block.traced for block, _ in blocks}.values()
-    rows, K_bb = [block.trace_rows for block, _ in blocks], next(iter(traces)).stiffness
-    if len(traces) > 1:
+    rows = [block.trace_rows for block, _ in blocks]
+    if len(traces) == 1:
+        K_bb = next(iter(traces)).stiffness
+    else:
         begins = np.cumsum([0, *(len(row) for row in rows)])
-        matrices = [traced.stiffness.entries() for traced in traces]
+        matrices = [traced.entries() for traced in traces]
         columns = [a + K.indices for a, K in zip(begins, matrices, strict=False)]
         table = np.cumsum(np.concatenate([[0], *(np.diff(K.indptr) for K in matrices)]))
         data, shape = np.concatenate([K.data for K in matrices]), (int(begins[-1]),) * 2
@@ -159,7 +161,7 @@ def _group(
 ) -> Group:
     """Return a group with these rows of its matrix in each column."""
     place = np.concatenate([k * size + row for k, row in enumerate(rows)])
-    found = np.concatenate([np.r_[part] for _, part in blocks])
+    found = np.concatenate([np.arange(part.start, part.stop) for _, part in blocks])
     first, straight = int(found[0]), np.arange(size)
     as_it_stands = np.array_equal(place, straight) and np.array_equal(found, first + straight)
     where = slice(first, first + size) if as_it_stands else found
@@ -168,11 +170,12 @@ def _group(
 
 def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
     """A W, as many columns at a time as are good for the cache."""
-    if W.ndim == 1 or W.shape[1] <= TOGETHER:
+    together = max(TOGETHER, NUMBERS // max(len(W), 1))
+    if W.ndim == 1 or W.shape[1] <= together:
         return apply(W)
     out = np.empty(W.shape, order="F")
-    for first in range(0, W.shape[1], TOGETHER):
-        some = slice(first, first + TOGETHER)
+    for first in range(0, W.shape[1], together):
+        some = slice(first, first + together)
         out[:, some] = apply(W[:, some])
     return out
 

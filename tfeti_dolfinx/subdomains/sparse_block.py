@@ -14,7 +14,14 @@ from scipy.linalg import null_space
 from scipy.linalg.lapack import dpocon, dpotrf, dpotri
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix, entries_of_rows, entries_within
+from tfeti_dolfinx.common.arrays import (
+    TINY,
+    Array,
+    Entries,
+    LocalMatrix,
+    entries_of_rows,
+    entries_within,
+)
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import (
@@ -53,7 +60,8 @@ class Stiffness:
     """
 
     def __init__(self, name: str, x: Array, K: Any, how: InverseFactory) -> None:
-        check_stiffness(name, K)
+        self.product = LocalMatrix(K)  # K, for products
+        check_stiffness(name, K, product=self.product)
         self.name, self.x, self.K, self.how = name, x, K, how
         self.size = int(K.shape[0])
         self.bs = self.size // max(len(x), 1)
@@ -85,11 +93,6 @@ class Stiffness:
         return np.stack([self._pinv.solve(column) for column in b.T], axis=1)
 
     @cached_property
-    def product(self) -> LocalMatrix:
-        """K, for products."""
-        return LocalMatrix(self.K)
-
-    @cached_property
     def stretch_over_shear(self) -> float:
         """About (λ + 2μ)/μ, as ``stretch_over_shear`` finds it."""
         return stretch_over_shear(self.x, self.bs, self.product.__matmul__)
@@ -107,7 +110,7 @@ class Traced:
 
     def __init__(self, stiffness: Stiffness, trace: Array) -> None:
         self._of, self.trace = stiffness, trace
-        self.inside = np.setdiff1d(np.arange(stiffness.size), trace, assume_unique=True)
+        self.inside = np.delete(np.arange(stiffness.size), trace)
 
     @cached_property
     def schur(self) -> Array | None:
@@ -117,22 +120,26 @@ class Traced:
         many ranks as R has columns, and SR_b = 0.
         """
         R, (known, A) = self._of.kernel[self.trace], self._of.pinv_on
-        if not len(self.inside) or not len(self.trace) or not np.isin(self.trace, known).all():
+        if not len(self.inside) or not len(self.trace) or not len(known):
+            return None
+        rows = np.minimum(np.searchsorted(known, self.trace), len(known) - 1)
+        if not np.array_equal(known[rows], self.trace):
             return None
         if not isinstance(self._of._pinv, CholeskyFactor):  # K_ρ⁻¹, unlike a K⁺ of one's own
             return None
         if R.size and np.linalg.svd(R, compute_uv=False)[-1] <= TOLERANCES.on_trace:
             return None
-        rows = np.searchsorted(known, self.trace)
-        sizes = 1.0 / np.sqrt(A.diagonal()[rows])
-        A = sizes[:, None] * A[np.ix_(rows, rows)] * sizes
-        L, failed = dpotrf(A)
-        if failed or dpocon(L, np.linalg.norm(A, 1))[0] < TOLERANCES.invertible:
+        A = A if len(rows) == len(known) else A[np.ix_(rows, rows)]
+        sizes = 1.0 / np.sqrt(A.diagonal())
+        A = sizes[:, None] * A * sizes
+        L, failed = dpotrf(A.T)  # in the order of columns, without a copy
+        if failed or dpocon(L, np.abs(A).sum(axis=1).max())[0] < TOLERANCES.invertible:
             return None
-        S = sizes[:, None] * dpotri(L)[0] * sizes
+        S = sizes[:, None] * dpotri(L, overwrite_c=True)[0] * sizes
         S += np.triu(S, 1).T
         W = S @ R
-        return np.asarray(S - W @ np.linalg.solve(R.T @ W, W.T))
+        S -= W @ np.linalg.solve(R.T @ W, W.T)  # in place, as columns lie one after the other
+        return S
 
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
@@ -143,10 +150,14 @@ class Traced:
             return Kw
         return Kw - self.coupling.transposed(self.inner.solve(self.coupling @ w))
 
+    def entries(self) -> Entries:
+        """K_bb, that on the trace."""
+        return entries_within(self._of.K, self.trace, self.trace)
+
     @cached_property
     def stiffness(self) -> LocalMatrix:
-        """K_bb, that on the trace."""
-        return LocalMatrix(entries_within(self._of.K, self.trace, self.trace))
+        """K_bb for products."""
+        return LocalMatrix(self.entries())
 
     @cached_property
     def coupling(self) -> LocalMatrix:
@@ -333,9 +344,7 @@ class SparseBlock(Block):
         return self.traced.apply_schur(placed(w, self.trace_rows))[self.trace_rows]
 
     def prepare(self, kind: OperatorKind) -> None:
-        """Make K_bb for ``"stiffness"`` and factor K_ii for ``"schur"``."""
-        if kind != "pinv":
-            self.traced.stiffness  # noqa: B018
+        """Factor K_ii for ``"schur"``, where S is not known from a dense K⁺."""
         if kind == "schur" and self.traced.schur is None:
             self.traced.inner, self.traced.coupling  # noqa: B018
 
