@@ -126,15 +126,9 @@ def compared(counts: Counts, whole: Counts) -> tuple[str, str]:
     return ", ".join(failed) if failed else ratio, f"{change:.0e}"
 
 
-def configure(parser: Any) -> None:
-    """Arguments of this benchmark."""
-    parser.add_argument("--only", nargs="+", choices=tuple(SCENES), help="scenes")
-    parser.add_argument("--mechanisms", nargs="+", choices=tuple(KNOWN))
-
-
 def main(argv: list[str]) -> Tables:
     """Run all scenes without each mechanism; returns the tables."""
-    arguments, _ = command_line(__doc__, argv, configure)
+    arguments, _ = command_line(__doc__, argv, only=SCENES, mechanisms=KNOWN)
     names = arguments.only or (QUICK if arguments.quick else tuple(SCENES))
     mechanisms = arguments.mechanisms or tuple(KNOWN)
     tables: Tables = {"Multiplications": [], "Change of u": []}

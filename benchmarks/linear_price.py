@@ -28,7 +28,6 @@ import tfeti_dolfinx as tfeti
 from benchmarks.tools import (
     choose_clock,
     command_line,
-    configure_clock,
     finish,
     picture,
     say,
@@ -209,13 +208,6 @@ SCENES = {
 }
 
 
-def configure(parser):
-    parser.add_argument("--large", action="store_true", help="2 million unknowns, no direct solver")
-    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
-    parser.add_argument("--repeats", type=int, default=3)
-    configure_clock(parser)
-
-
 def contact(made, qp_type, options):
     """Solve a contact from scratch; the problem and a row."""
     types = {"tfeti_qp_type": qp_type, "tfeti_pc_type": "auto"}
@@ -285,11 +277,12 @@ def draw(path, tables):
 
 def main(argv):
     """Run the studies and write them; returns the tables."""
-    arguments, rest = command_line(__doc__, argv, configure)
+    given = {"large": False, "scenes": SCENES, "repeats": 3, "processor": False}
+    arguments, rest = command_line(__doc__, argv, **given)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
     options, ranks, unit = petsc_options(rest), MPI.COMM_WORLD.size, choose_clock(arguments)
     tables = {}
-    for name in arguments.scenes:
+    for name in arguments.scenes or SCENES:
         made = scene(name, SCENES[name][size])
         rows, report = study(made, options, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"

@@ -60,7 +60,7 @@ def row(name: str, words: list[str]) -> dict[str, Any]:
 
 def main(argv: list[str]) -> Tables:
     """Run the demos; returns their table."""
-    arguments, options = command_line(__doc__, argv, configure)
+    arguments, options = command_line(__doc__, argv, large=False, only=DEMOS)
     runs = LARGE if arguments.large else dict.fromkeys(DEMOS, ["--quick"] * arguments.quick)
     rows = []
     for name in arguments.only or runs:
@@ -70,12 +70,6 @@ def main(argv: list[str]) -> Tables:
     if arguments.large:  # of some minutes each, so each has a commit of its own
         tables = {f"Load steps of a large {row['demo'].strip('`')}": [row] for row in rows}
     return finish(arguments, "nonlinear_steps", tables)
-
-
-def configure(parser: Any) -> None:
-    """Arguments of this benchmark."""
-    parser.add_argument("--large", action="store_true", help="large meshes, of some minutes")
-    parser.add_argument("--only", nargs="+", choices=DEMOS, help="demos")
 
 
 if __name__ == "__main__":

@@ -208,15 +208,11 @@ def growing(few, many, ratio):
     return [dict(zip(names, line, strict=True)) for line in table]
 
 
-def configure(parser):
-    parser.add_argument("--ranks", nargs="+", type=int, default=[1, 2, 4, 8, 16, 32])
-
-
 def main(argv):
     """Count, compare, and write the tables; returns them."""
     if argv[:1] == ["--worker"]:
         return worker(*argv[1:])
-    arguments, _ = command_line(__doc__, argv, configure)
+    arguments, _ = command_line(__doc__, argv, ranks=[1, 2, 4, 8, 16, 32])
     quick, tables = arguments.quick, {}
     cubes, ranks = (8, (1, 2)) if quick else (64, arguments.ranks)
     with tempfile.TemporaryDirectory() as folder:

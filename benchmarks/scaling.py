@@ -1,6 +1,6 @@
 """Demos on more subdomains, and on more ranks.
 
-    ./run python3 benchmarks/scaling.py weak|strong [--quick | --large] [--ranks 2]
+    ./run python3 benchmarks/scaling.py [weak | strong] [--quick | --large] [--ranks 2]
 
 Starts mpirun itself; runs take turns, and of each the best counts. Set-up is included; gmsh, which
 meshes on one rank, has a column of its own.
@@ -20,7 +20,6 @@ from benchmarks.tools import (
     best_runs,
     column,
     command_line,
-    configure_runs,
     curves,
     finish,
     picture,
@@ -40,11 +39,6 @@ STRONG = {
 }
 STRONG_LARGE = {**STRONG, "hertz_3d": ["--unknowns", 235_000, "--subdomains", 64]}
 STRONG_QUICK = {"cube_3d": ["--subdomains", 8, "--cells", 3]}
-
-
-def configure(parser):
-    parser.add_argument("study", choices=list(STUDIES))
-    configure_runs(parser)
 
 
 TRIAD = """
@@ -132,8 +126,10 @@ STUDIES = {
 
 def main(argv):
     """Run the tables and write them; returns them."""
-    arguments, options = command_line(__doc__, argv, configure)
-    run, columns = STUDIES[arguments.study]
+    study = "strong" if "strong" in argv else "weak"
+    rest = [word for word in argv if word not in STUDIES]
+    arguments, options = command_line(__doc__, rest, large=False, ranks=2, repeats=3)
+    run, columns = STUDIES[study]
 
     def draw(path, tables):
         """A panel for each pair of columns, a line for each table."""
@@ -144,9 +140,9 @@ def main(argv):
                     for title, rows in tables.items()
                 }
                 log = "x" if y == "F" else "xy"
-                curves(panel, f"{arguments.study} scaling", (x, WORDS.get(y, y)), lines, log)
+                curves(panel, f"{study} scaling", (x, WORDS.get(y, y)), lines, log)
 
-    return finish(arguments, f"scaling_{arguments.study}", run(arguments, options), draw)
+    return finish(arguments, f"scaling_{study}", run(arguments, options), draw)
 
 
 if __name__ == "__main__":

@@ -36,11 +36,6 @@ QUICK = ("triangle",)
 GROUPS = tuple(dict.fromkeys(ladder.group for ladder in LADDERS))
 
 
-def configure(parser):
-    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
-    parser.add_argument("--cells", nargs="+", choices=CELLS)
-
-
 def verdict(scene: Scene, row: dict[str, Any]) -> str:
     """What came out, in one word."""
     if scene.joined and row["error"].startswith("NoSolutionError"):
@@ -116,11 +111,11 @@ def ladders(tables: Tables) -> Tables:
 
 def main(argv):
     """Climb the ladders and write what came out; returns the tables."""
-    arguments, _ = command_line(__doc__, argv, configure)
+    arguments, _ = command_line(__doc__, argv, groups=GROUPS, cells=CELLS)
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     cells = arguments.cells or (QUICK if arguments.quick else CELLS)
-    tables: dict[str, list[dict[str, Any]]] = {group: [] for group in arguments.groups}
+    tables: dict[str, list[dict[str, Any]]] = {name: [] for name in arguments.groups or GROUPS}
     for ladder in LADDERS:
         if ladder.group in tables:
             for cell in ladder.cells:

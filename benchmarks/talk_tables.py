@@ -119,14 +119,9 @@ def draw(path, tables):
             curves(panel, f"{title}, rtol {rows[-1]['rtol']}", labels, lines, log="x")
 
 
-def configure(parser):
-    parser.add_argument("--large", action="store_true", help="the largest rows too")
-    parser.add_argument("--rtol", type=float, nargs="+", default=[1e-4, 1e-6])
-
-
 def main(argv):
     """Run the tables and write them; returns them."""
-    arguments, options = command_line(__doc__, argv, configure)
+    arguments, options = command_line(__doc__, argv, large=False, rtol=[1e-4, 1e-6])
     count = 3 if arguments.large else 1 if arguments.quick else 2
     tables = {
         title: table(demo, talk, list(talk)[:count], arguments, options)

@@ -46,7 +46,6 @@ from benchmarks.tools import (
     Tables,
     column,
     command_line,
-    configure_clock,
     curves,
     finish,
     json_of,
@@ -398,19 +397,14 @@ def draw(path, tables):
                 curves(panel, title, ("seconds", f"relative error, {name}"), lines, names=names)
 
 
-def configure(parser):
-    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
-    parser.add_argument("--ranks", nargs="+", type=int, default=[1, 2], help="numbers of ranks")
-    configure_clock(parser)
-
-
 def main(argv):
     """Run the cases and write their tables; returns them."""
     if argv[:1] == ["--worker"]:
         return worker(*argv[1:3], Path(argv[3]))
-    arguments, _ = command_line(__doc__, argv, configure)
+    given = {"scenes": SCENES, "ranks": [1, 2], "processor": False}
+    arguments, _ = command_line(__doc__, argv, **given)
     tables: Tables = {}
-    for name in arguments.scenes:
+    for name in arguments.scenes or SCENES:
         with tempfile.TemporaryDirectory() as folder:
             tables |= study(name, arguments, Path(folder))
         write_tables(arguments.output, "time_against_error", tables)  # a later scene may fail

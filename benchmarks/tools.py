@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,13 @@ Tables = dict[str, list[dict[str, Any]]]
 
 
 def command_line(
-    description: str | None,
-    argv: Sequence[str],
-    configure: Callable[[argparse.ArgumentParser], None] | None = None,
+    description: str | None, argv: Sequence[str], **given: Any
 ) -> tuple[argparse.Namespace, list[str]]:
-    """The parsed arguments, and the PETSc options that follow them."""
+    """The parsed arguments, and the PETSc options that follow them.
+
+    A benchmark's own arguments are ``given``: False makes a switch, a number is a default, and so
+    is a list of numbers; words are choices, of which some may be given, None if none are.
+    """
     parser = argparse.ArgumentParser(
         description=description,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -48,30 +50,24 @@ def command_line(
     parser.add_argument("--quick", action="store_true", help="sizes of a few seconds")
     parser.add_argument("--output", type=Path, default=Path("results"), help="folder")
     parser.add_argument("--document", metavar="COMMIT", help="put the tables into docs/, too")
-    if configure is not None:
-        configure(parser)
+    for name, default in given.items():
+        several = list(default) if isinstance(default, Iterable) else []
+        if default is False:
+            parser.add_argument(f"--{name}", action="store_true")
+        elif several and isinstance(several[0], str):
+            parser.add_argument(f"--{name}", nargs="+", choices=several)
+        else:
+            kind, many = type((several or [default])[0]), {"nargs": "+"} if several else {}
+            help = f"default {default}"
+            parser.add_argument(f"--{name}", type=kind, default=default, help=help, **many)
     arguments, rest = parser.parse_known_args(argv)
     if unknown := [word for word in rest if word.startswith("--")]:
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     return arguments, rest
 
 
-def configure_runs(parser: argparse.ArgumentParser) -> None:
-    """Arguments of benchmarks that start demos."""
-    parser.add_argument("--large", action="store_true", help="the largest sizes, too")
-    parser.add_argument("--ranks", type=int, default=2, help="ranks of each run")
-    parser.add_argument("--repeats", type=int, default=3, help="runs, of which the best counts")
-
-
-def configure_clock(parser: argparse.ArgumentParser) -> None:
-    """An argument of benchmarks that may share their machine."""
-    parser.add_argument(
-        "--processor", action="store_true", help="seconds of the processor, not of the wall"
-    )
-
-
 def choose_clock(arguments: argparse.Namespace) -> str:
-    """What seconds are; from now on all clocks count those of the processor, if asked for.
+    """What seconds are; with ``--processor`` all clocks count those of the processor from now on.
 
     On a machine that others use, too, they say more than those of the wall.
     """

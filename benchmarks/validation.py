@@ -510,14 +510,9 @@ LONG = ("hemispheres", "bar_on_wall", "rigid_sphere", "plastic_indentation")
 QUICK = tuple(name for name in CASES if name not in LONG)
 
 
-def configure(parser: Any) -> None:
-    """Arguments of this benchmark."""
-    parser.add_argument("--only", nargs="+", choices=tuple(CASES), help="cases")
-
-
 def main(argv: list[str]) -> Tables:
     """Run the cases; returns their table."""
-    arguments, _ = command_line(__doc__, argv, configure)
+    arguments, _ = command_line(__doc__, argv, only=CASES)
     scale = 1.0 if arguments.quick else FINE
     rows = []
     for name in arguments.only or (QUICK if arguments.quick else tuple(CASES)):

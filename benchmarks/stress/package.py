@@ -158,6 +158,5 @@ def _reported(problem: tfeti.ContactProblem) -> dict[str, Any]:
         "warnings": report.warnings + report.notes,
         "F": report.F_multiplications,
         "S": report.preconditioner_multiplications,
-        "qp": report.seconds.get("solve", 0.0),
         "estimate": report.residuals.get("displacement_error", 0.0),
     }
