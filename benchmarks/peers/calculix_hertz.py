@@ -21,54 +21,45 @@ def rows(table):
     return "\n".join(", ".join(map(str, row)) for row in table)
 
 
-def begin(nodes, cells, facets, tool, law, slope):
-    """A body, and a tool, one element whose type, nodes and pressing face are given."""
-    kind, face, tags = tool
-    n, m = len(nodes) - len(tags), len(cells)
-    places = enumerate(nodes.tolist())
+def deck(data, slope=1e3):
+    """The input of CalculiX; the block is one element, all of it prescribed."""
+    cells, a, R, E, nu = (data[name] for name in ("cells", "a", "R", "E", "nu"))
+    up, wide = a**2 / (2 * R), WIDE * a
+    block = [(-wide, up - a), (wide, up - a), (wide, up), (-wide, up)]
+    nodes, n, m = np.concatenate((data["points"], block)), len(data["points"]), len(cells)
+    top, load = data["top cells"], float(data["traction"])
     return f"""*NODE, NSET=ALL
-{rows((k + 1, f"{x:.12e}", f"{y:.12e}", 0.0) for k, (x, y) in places)}
+{rows((k + 1, f"{x:.12e}", f"{y:.12e}", 0.0) for k, (x, y) in enumerate(nodes.tolist()))}
 *ELEMENT, TYPE={"CPE3" if cells.shape[1] == 3 else "CPE6"}, ELSET=BODY
 {rows(np.column_stack((np.arange(1, m + 1), cells + 1)))}
-*ELEMENT, TYPE={kind}, ELSET=TOOL
-{rows([[m + 1, *tags]])}
+*ELEMENT, TYPE=CPE4, ELSET=TOOL
+{rows([[m + 1, *range(n + 1, n + 5)]])}
 *NSET, NSET=TOOL, GENERATE
-{n + 1}, {len(nodes)}
+{n + 1}, {n + 4}
 *SURFACE, NAME=SLAVE, TYPE=ELEMENT
-{rows((cell + 1, f"S{FACE[opposite]}") for cell, opposite in facets)}
+{rows((cell + 1, f"S{FACE[opposite]}") for cell, opposite in data["contact cells"])}
 *SURFACE, NAME=MASTER, TYPE=ELEMENT
-{m + 1}, {face}
+{m + 1}, S3
 *MATERIAL, NAME=STUFF
-{law}
+*ELASTIC
+{E}, {nu}
 *SOLID SECTION, ELSET=BODY, MATERIAL=STUFF
 1.
 *SOLID SECTION, ELSET=TOOL, MATERIAL=STUFF
 1.
 *SURFACE INTERACTION, NAME=TOUCH
 *SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR
-{slope:.6e}, 0.
+{slope * E / a:.6e}, 0.
 *CONTACT PAIR, INTERACTION=TOUCH, TYPE=SURFACE TO SURFACE
 SLAVE, MASTER
-"""
-
-
-def deck(data, slope=1e3):
-    """The input of CalculiX."""
-    n, cells = len(data["points"]), data["cells"]
-    a, R, E, nu = (float(data[name]) for name in ("a", "R", "E", "nu"))
-    up, wide = a**2 / (2 * R), WIDE * a
-    block = [(-wide, up - a), (wide, up - a), (wide, up), (-wide, up)]
-    tool, nodes = ("CPE4", "S3", np.arange(n + 1, n + 5)), np.concatenate((data["points"], block))
-    body = begin(nodes, cells, data["contact cells"], tool, f"*ELASTIC\n{E}, {nu}", slope * E / a)
-    load = float(data["traction"])
-    return f"""{body}*BOUNDARY
+*BOUNDARY
 TOOL, 1, 2, 0.0
 {rows((node, 1, 1, 0.0) for node in np.unique(data["axis"]) + 1)}
 *STEP, INC=100
 *STATIC, SOLVER=SPOOLES
 1., 1.
 *DLOAD
-{rows((cell + 1, f"P{FACE[opposite]}", f"{load:.12e}") for cell, opposite in data["top cells"])}
+{rows((cell + 1, f"P{FACE[opposite]}", f"{load:.12e}") for cell, opposite in top)}
 *CONTACT FILE
 CDIS, CSTR
 *END STEP

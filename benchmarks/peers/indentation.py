@@ -1,14 +1,11 @@
-"""Seconds to a force in plasticity beside GetFEM and CalculiX: a wheel pressed into a block.
+"""Seconds to a force in plasticity beside GetFEM: a wheel pressed into a block.
 
     python3 benchmarks/peers/compare.py indentation      (not inside of ./run)
 
 J2 plasticity with linear hardening, small strain, plane strain, degree 2: a rigid parabola pressed
 into half of a block, clamped below, in eight steps. GetFEM: its brick with return mapping, contact
-as in getfem_hertz.py; CalculiX: penalty as in calculix_hertz.py, 1000 E/a.
+as in getfem_hertz.py.
 """
-
-import tempfile
-from pathlib import Path
 
 from compare import NAME, ByForce, facets_on
 
@@ -108,58 +105,5 @@ def getfem(points, cells, r=1.0):
     return solve
 
 
-def deck(points, cells, slope=1e3):
-    """The input of CalculiX, and its unknowns; the wheel is one element, all of it prescribed."""
-    import numpy as np
-    from calculix_hertz import begin, rows
-
-    edges = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    ends, middle = np.unique(edges, axis=0, return_inverse=True)
-    nodes = np.vstack((points, points[ends].mean(axis=1)))
-    numbered = np.hstack((cells, len(points) + middle.reshape(-1, 3)))
-    facets = facets_on(np.isclose(points[:, 1], 0.0)[cells])
-    x = SIZE * np.array([0.0, 1.0, 1.0, 0.0, 0.5, 1.0, 0.5, 0.0])
-    y = x**2 / (2 * R) + 0.1 * np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.5, 1.0, 0.5])
-    tool = "CPE8", "S1", len(nodes) + np.arange(1, 9)
-    law = f"*ELASTIC\n{E}, {NU}\n*PLASTIC\n{STRENGTH}, 0.\n{STRENGTH + HARDENING}, 1."
-    places = np.vstack((nodes, np.stack((x, y), 1)))
-    body = begin(places, numbered, facets, tool, law, slope * E / NEAR)
-    low, axis = (np.flatnonzero(np.isclose(nodes[:, k], at)) + 1 for k, at in ((1, -SIZE), (0, 0)))
-    words = f"""{body}*NSET, NSET=LOW
-{rows(low[:, None])}
-*BOUNDARY
-LOW, 1, 2, 0.0
-{rows((node, 1, 1, 0.0) for node in axis)}
-*STEP, INC=1000
-*STATIC, SOLVER=SPOOLES
-{1 / STEPS}, 1., 1e-5, {1 / STEPS}
-*BOUNDARY
-TOOL, 1, 1, 0.0
-TOOL, 2, 2, {-DEPTH}
-*NODE PRINT, NSET=LOW, TOTALS=ONLY, FREQUENCY=1000
-RF
-*END STEP
-"""
-    return words, nodes.size
-
-
-def calculix(points, cells):
-    """The same by CalculiX; in benchmarks/peers/run."""
-    from calculix_hertz import solved
-
-    words, unknowns = deck(points, cells)
-    job = Path(tempfile.mkdtemp()) / "job"
-    job.with_suffix(".inp").write_text(words)
-
-    def solve():
-        steps = solved(job).count(" iteration ")
-        force = job.with_suffix(".dat").read_text().split()[-2]
-        return abs(float(force)), unknowns, steps
-
-    return solve
-
-
 SIZES = (4, 8, 16, 24)  # elements of equal size near the wheel
-SCENE = ByForce(
-    "indentation", "indentation", SIZES, block, {NAME: ours, "GetFEM": getfem, "CalculiX": calculix}
-)
+SCENE = ByForce("indentation", "indentation", SIZES, block, {NAME: ours, "GetFEM": getfem})
