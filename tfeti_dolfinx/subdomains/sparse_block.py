@@ -138,7 +138,10 @@ class Traced:
         S = sizes[:, None] * dpotri(L, overwrite_c=True)[0] * sizes
         S += np.triu(S, 1).T
         W = S @ R
-        S -= W @ np.linalg.solve(R.T @ W, W.T)  # in place, as columns lie one after the other
+        try:
+            S -= W @ np.linalg.solve(R.T @ W, W.T)  # in place, as columns lie one after the other
+        except np.linalg.LinAlgError:  # a soft part moves far beside stiff ones
+            return None
         return S
 
     def apply_schur(self, w: Array) -> Array:
