@@ -1,5 +1,7 @@
 """Mortar conditions between bodies: rows, forces, late pairs, an independent reference."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import ufl
@@ -21,6 +23,7 @@ from reference import mortar
 from scenes import clamp, displacement, relative
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.errors import NoSolutionError
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
@@ -144,6 +147,28 @@ def test_a_body_that_only_far_surfaces_hold_is_found():
     problem.solve()
     assert problem.report.late_contact_rows == problem.report.contact_rows == 5
     assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, atol=1e-6)
+
+
+@DEGREES
+def test_an_edge_where_both_sides_are_clamped_bears_nothing_if_they_open(cell, degree):
+    """They open as x² from there, which a dual multiplier takes for an overlap."""
+    flat = (1.0,) * (2 if cell in CELLS[2:] else 1)
+    low, high = (0.0,) * len(flat), (4.0, *flat[1:])
+    parts = [
+        ("lower", (*low, -1.0), (*high, 0.0), (6, *(2,) * len(flat))),
+        ("upper", (*low, 0.0), (*high, 1.0), (8, *(3,) * len(flat))),
+    ]
+    mesh, tags, names = boxes(cell, parts)
+    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
+    bcs, load = clamped(d, "lower left", "upper left"), pressed(d, -1e-4, "upper right")
+    table = tfeti.Obstacle("upper bottom", tfeti.Plane((0, 0, 0), (0,) * len(flat) + (1,)))
+    for contact in (PAIR, sided(*PAIR.surfaces[::-1]), table):
+        problem = two_body_problem(d, load, bcs, [contact], degree, **TO_ROUNDING)
+        problem.solve()
+        assert np.all(problem.solution.contact().force == 0.0)
+        overlap = replace(contact, gap=-1e-3)
+        with pytest.raises(NoSolutionError, match="nodes penetrate by up to 0.001 whatever"):
+            two_body_problem(d, load, bcs, [overlap], degree).solve()
 
 
 def three(cell="quadrilateral"):

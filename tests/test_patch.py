@@ -14,7 +14,7 @@ from bodies import (
     two_body_problem,
 )
 from dolfinx import fem
-from scenes import largest
+from scenes import clamp, largest
 
 import tfeti_dolfinx as tfeti
 
@@ -90,6 +90,31 @@ def test_uniform_pressure_and_linear_displacement(cell, degree, subdomains, orde
     assert error_of_displacement(problem) < 1e-9
     if degree < 3:
         check_tractions(problem, order[0] == "upper bottom")
+
+
+@pytest.mark.parametrize(("cell", "degree"), [("triangle", 2), ("hexahedron", 1)])
+def test_uniform_pressure_between_bodies_that_are_held_all_around(cell, degree):
+    d = stacked(cell, 3, 4, jagged)
+    gdim = d.mesh.geometry.dim
+    sides = ["left", "right", "front", "back"][: 2 * gdim - 2]
+
+    def bcs(V):
+        exact = fem.Function(V)
+        exact.interpolate(lambda x: linear_displacement(x.T, gdim).T)
+        names = [
+            "lower bottom",
+            *(f"{body} {side}" for body in ("lower", "upper") for side in sides),
+        ]
+        return [clamp(V, d.facets(name), exact) for name in names]
+
+    for order in ORDERS:
+        problem = two_body_problem(
+            d, pressed(d, PRESSURE), bcs, [sided(*order)], degree, **TO_ROUNDING
+        )
+        problem.solve()
+        assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
+        assert np.isclose(np.abs(problem.solution.contact().resultant.force[-1]), PRESSURE)
+        assert error_of_displacement(problem) < 1e-9
 
 
 def check_tractions(problem, upper_is_secondary):

@@ -273,6 +273,8 @@ class System:
             new = self._prescribed = prescribe(self._dofs, given)
             if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
                 self.change("constraints")
+                if old and self._search and self._search.sees(new.flag != old.flag):
+                    self.change("places")
             elif any_rank(comm, not np.array_equal(new.value, old.value)):
                 self.change("right side")
             self._conditions = given
@@ -402,7 +404,9 @@ class System:
         ]
         decided = before is not None or self._known_rows is not None
         stiffness = None if decided else self._blocks
-        self._search = ContactSearch(contacts, dofs, stiffness, self.origin, tools)
+        self._search = ContactSearch(
+            contacts, dofs, stiffness, self.origin, tools, made(self._prescribed).flag
+        )
         if before is None:
             tools.check_begin(contacts, self._search.records)
         else:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from tfeti_dolfinx.common.agreement import agreeing
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -260,10 +261,24 @@ class ContactState:
 
     @cached_property
     def force(self) -> Array:
-        """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
-        rows = self.gluing.contact
-        force = np.zeros(len(self.gluing.records))
+        """Normal force s_i λ_i of each contact condition of this rank. Collective at first use.
+
+        It is 0 without a row, but where held vertices touch: they bear what their neighbours do.
+        """
+        rows, records = self.gluing.contact, self.gluing.records
+        force = np.zeros(len(records))
         force[rows.condition] = rows.scale * self.lam[self.gluing.constraints.sets.normals]
+        if not any_rank(self.dofs.comm, len(records.held) > 0):
+            return force
+        pressure = np.divide(force, self.area, out=0.0 * force, where=self.area > 0.0)
+        beside = np.zeros(len(records.held))
+        for contact in range(len(self.contacts)):
+            own, of = records.contact == contact, records.contact[records.held] == contact
+            known = np.zeros(self.dofs.num_groups)
+            known[records.group[own]] = pressure[own]
+            (beside[of],) = self.dofs.lookup(records.beside[of], known)
+        at = self.gluing.closed()
+        force[at] = (sum_rows(records.held, records.share * beside, len(records)) * self.area)[at]
         return force
 
     @cached_property
@@ -340,10 +355,12 @@ class ContactState:
         status = np.full(len(gluing.records), ContactStatus.OPEN)
         touching = gluing.contact.condition[self.carrying[sets.normals]]
         status[touching] = ContactStatus.TOUCHING
+        decided = gluing.contact.decided
+        status[decided[self.force[decided] > 0.0]] = ContactStatus.TOUCHING
         rows = gluing.tangents
         held = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
         rubbing = np.where(held, ContactStatus.STICK, ContactStatus.SLIP)
-        closed = np.isin(rows.condition, np.concatenate((touching, gluing.contact.decided)))
+        closed = np.isin(rows.condition, np.concatenate((touching, decided)))
         status[rows.condition[closed]] = rubbing[closed]
         return status
 

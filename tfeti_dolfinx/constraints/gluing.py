@@ -274,10 +274,10 @@ class Gluing:
         """
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
-        held = relative_motion(records, self.dofs, self.prescribed.value) - records.motion
-        left = records.gap - np.sum(records.normal * held, axis=1)
+        held, left = self._held()
         decided, comm = left[normals.decided], self.dofs.comm
-        overlaps = comm.allreduce(int(np.sum(decided < -TOLERANCES.overlap * self.length)))
+        wrong = decided < -self._rounding()[normals.decided]
+        overlaps = comm.allreduce(int(np.sum(wrong)))
         deepest = comm.allreduce(float(decided.min(initial=0.0)), op=MPI.MIN)
         if overlaps:
             raise NoSolutionError(
@@ -293,6 +293,22 @@ class Gluing:
         c[sets.normals] = left[normals.condition] * normals.scale
         c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
         return c
+
+    def closed(self) -> Array:
+        """Return the conditions that prescribed components decide and that touch. Collective."""
+        at, (_, left) = self.contact.decided, self._held()
+        return np.asarray(at[np.abs(left[at]) <= self._rounding()[at]])
+
+    def _held(self) -> tuple[Array, Array]:
+        """Return what prescribed components make of all v_i, and what that leaves of gaps."""
+        records = self.records
+        held = relative_motion(records, self.dofs, self.prescribed.value) - records.motion
+        return held, records.gap - np.sum(records.normal * held, axis=1)
+
+    def _rounding(self) -> Array:
+        """Slack of gaps, since facets of curved surfaces may overlap where bodies do not."""
+        curved = np.abs(self.records.curved_gap - self.records.geometric_gap)
+        return np.asarray(curved + TOLERANCES.overlap * self.length)
 
     def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
         """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.

@@ -32,6 +32,7 @@ from tfeti_dolfinx.mortar.facets import (
     local_facets,
     surface_facets,
     with_averaged_normals,
+    with_held_vertices,
 )
 from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_curvature
 from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
@@ -42,6 +43,7 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 Gap: TypeAlias = str | float | Callable[[Array], ArrayLike]
 # what the geometry has for a gap: the distance of facets, or of the smooth surfaces through them
 GEOMETRY, CURVED = "geometry", "curved"
+Flag: TypeAlias = Array | None  # whether components of owned groups are prescribed, (g, bs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +70,9 @@ class ContactPartner(ABC):
         """Names or tags of the surfaces, that with the multipliers first."""
 
     @abstractmethod
-    def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
+    def records(
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, flag: Flag = None
+    ) -> ContactRecords:
         """Return the conditions; raise an InputError where a surface, shape, gap or law is unfit.
 
         Conditions with a gap above the reach are out of reach; those of surfaces three times as far
@@ -91,14 +95,14 @@ class ContactPartner(ABC):
         return float(reach)
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, flag: Flag = None
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact with its sides decided, and its conditions up to a reach, and so deep.
 
         ``stiffness`` is the block of K of each primal node, shape ``(num_nodes, bs, bs)``; None:
         the sides are those of an earlier search.
         """
-        return self, self.records(dofs, contact, reach, reach)
+        return self, self.records(dofs, contact, reach, reach, flag)
 
     def with_gap(self, gap: Gap) -> Self:
         """Return the same contact with another ``gap=``."""
@@ -247,7 +251,9 @@ class Obstacle(ContactPartner):
         """The surface."""
         return (self.surface,)
 
-    def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
+    def records(
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, flag: Flag = None
+    ) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective.
 
         With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex (or the gap that is
@@ -273,6 +279,8 @@ class Obstacle(ContactPartner):
         vertices = facets.vertices.ravel()
         normals = dofs.reduce_on_owners(vertices, towards, np.maximum, -np.inf)
         normals[~np.isfinite(normals)] = 0.0  # off the surface
+        if not (isinstance(self.shape, RigidBody) and self.shape.free):
+            facets = with_held_vertices(facets, dofs, normals, flag)
         side = Side(facets, hat_areas(kind, facets), normals)
         integrals = integrate_distance(kind, facets, distance.reshape(facets.vertices.shape))
         found = conditions(dofs, contact, side, integrals)
@@ -361,7 +369,7 @@ class Contact(ContactPartner):
         return min(reach, diameter(decomposition))
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, flag: Flag = None
     ) -> tuple[Contact, ContactRecords]:
         """Return the contact with its secondary side as ``a``, and its conditions. Collective.
 
@@ -370,7 +378,7 @@ class Contact(ContactPartner):
         """
         cite("mortar")
         settled = self._named_first(dofs.decomposition)
-        sides = settled._sides(dofs)
+        sides = settled._sides(dofs, flag)
         found = settled._meet(sides, dofs, contact, reach, reach)
         if stiffness is None:
             return settled, found
@@ -391,13 +399,15 @@ class Contact(ContactPartner):
             log.warning(EDGES, self.name, settled.a)
         return settled, found
 
-    def records(self, dofs: TornDofs, contact: int, reach: float, depth: float) -> ContactRecords:
+    def records(
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, flag: Flag = None
+    ) -> ContactRecords:
         """One condition per node of ``a`` opposite to ``b``. Collective.
 
         With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is
         n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i.
         """
-        return self._meet(self._sides(dofs), dofs, contact, reach, depth)
+        return self._meet(self._sides(dofs, flag), dofs, contact, reach, depth)
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
         """Return gaps of its conditions; those of the geometry may not overlap too deep."""
@@ -410,7 +420,7 @@ class Contact(ContactPartner):
             )
         return found
 
-    def _sides(self, dofs: TornDofs) -> tuple[Side, Side]:
+    def _sides(self, dofs: TornDofs, flag: Flag) -> tuple[Side, Side]:
         """Facets of both surfaces, with averaged normals and curvature."""
         gdim = dofs.V.mesh.geometry.dim
         if dofs.bs != gdim:
@@ -427,6 +437,7 @@ class Contact(ContactPartner):
                 raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")
             facets, normals = with_averaged_normals(facets, dofs)
             facets = with_curvature(facets, dofs, kind)
+            facets = with_held_vertices(facets, dofs, normals, flag)
             sides.append(Side(facets, hat_areas(kind, facets), normals))
         return sides[0], sides[1]
 
@@ -441,7 +452,8 @@ class Contact(ContactPartner):
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
-            integrals = integrate(kind, secondary, primary, segments)
+            closed = not isinstance(self.gap, str)
+            integrals = integrate(kind, secondary, primary, segments, closed)
         averted = comm.allreduce(int(segments.averted))
         if averted and comm.allreduce(len(segments.weight)) == 0:
             raise InputError(

@@ -30,7 +30,7 @@ class Friction(IntEnum):
 
 
 # tables of whole numbers, and of flags
-WHOLE = ("contact", "group", "condition", "entry_group", "friction")
+WHOLE = ("contact", "group", "condition", "entry_group", "friction", "held", "beside")
 FLAGS = ("conforms", "within_reach")
 
 
@@ -68,6 +68,11 @@ class ContactRecords:
     friction: Array  # `Friction` of each condition, shape (n,)
     place: Array  # Σ_j w_ij x_j, where a rigid body that moves meets it, else 0, shape (n, gdim)
     motion: Array  # displacement of that body there, as far as it is known, shape (n, gdim)
+    # neighbours of vertices that are held, which say what pressure these bear: the condition, the
+    # global group of the neighbour, and its share, which add up to 1, shape (p,)
+    held: Array
+    beside: Array
+    share: Array
     candidates: int = 0  # nodes of the contact surface whose groups this rank owns
 
     def __len__(self) -> int:
@@ -93,7 +98,10 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     if len(records) == 1:
         return records[0]
     starts = np.cumsum([0, *(len(r) for r in records)])
-    moved = [replace(r, condition=r.condition + s) for r, s in zip(records, starts, strict=False)]
+    moved = [
+        replace(r, condition=r.condition + s, held=r.held + s)
+        for r, s in zip(records, starts, strict=False)
+    ]
     shapes = {"frame": (0, gdim, gdim), "place": (0, gdim), "motion": (0, gdim)}
     joined: dict[str, Array] = {}
     for name in (field.name for field in fields(ContactRecords) if field.name != "candidates"):
@@ -158,6 +166,9 @@ def conditions(
     slot, column, value = _merged(dofs, integrals.entries)
     kept = (place[slot] >= 0) & (np.abs(value) > SEARCH.negligible * np.maximum(area[slot], 1e-300))
     slot, column, value = slot[kept], column[kept], value[kept]
+    of, beside, share = _merged(dofs, (integrals.shares,))
+    kept = place[of] >= 0
+    held, beside, share = place[of[kept]], beside[kept], share[kept]
     return ContactRecords(
         contact=np.full(len(chosen), contact),
         group=chosen,
@@ -175,6 +186,9 @@ def conditions(
         friction=np.full(len(chosen), Friction.NONE),
         place=np.zeros((len(chosen), dofs.bs)),
         motion=np.zeros((len(chosen), dofs.bs)),
+        held=held,
+        beside=beside,
+        share=share / sum_rows(held, share, len(chosen))[held],
         candidates=int(np.sum(whole > 0.0)),
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, summed
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
@@ -30,7 +30,8 @@ class ContactSearch:
     an InputError where a pair is there twice, or a contact raises it. ``stiffness`` is the block of
     K of each primal node, shape ``(num_nodes, bs, bs)``; without it sides are decided. ``origin``
     is the displacement in primal order at which the mesh is, by default 0: gaps are those of the
-    total one. Tools are where they are placed.
+    total one. Tools are where they are placed. ``flag`` says which components of owned groups are
+    prescribed, shape ``(g, bs)``; None: none.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
@@ -46,8 +47,9 @@ class ContactSearch:
         stiffness: Array | None,
         origin: Array | None = None,
         tools: Tools | None = None,
+        flag: Array | None = None,
     ) -> None:
-        self._tools = tools
+        self._tools, self._flag = tools, flag
         self._dofs, self._origin, decomposition = dofs, origin, dofs.decomposition
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
@@ -55,7 +57,7 @@ class ContactSearch:
         self._reach, self.said = list(self._depths), list[str]()
         check_together(contacts, decomposition)
         settled = [
-            contact.settled(dofs, i, self._reach[i], stiffness)
+            contact.settled(dofs, i, self._reach[i], stiffness, flag)
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
@@ -77,6 +79,14 @@ class ContactSearch:
         pairs = zip(self.contacts, self._records, strict=True)
         found = [friction_values(c.name, c.friction, records, self._dofs) for c, records in pairs]
         return np.concatenate([none, *found])
+
+    def sees(self, changed: Array) -> bool:
+        """Return whether flags of owned groups' components have one on a contact surface."""
+        dofs = self._dofs
+        names = [name for contact in self.contacts for name in contact.surfaces]
+        nodes = [facet_nodes(dofs, dofs.decomposition.facets(name)).ravel() for name in names]
+        groups = dofs.group[np.concatenate([np.empty(0, dtype=np.int64), *nodes])]
+        return any_rank(dofs.comm, dofs.lookup(groups, changed)[0])
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
         """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
@@ -203,7 +213,7 @@ class ContactSearch:
     def _search(self, i: int, reach: float) -> ContactRecords:
         """Conditions up to a larger reach, of which those have rows that had them before."""
         known = self._records[i]
-        found = self.contacts[i].records(self._dofs, i, reach, self._depths[i])
+        found = self.contacts[i].records(self._dofs, i, reach, self._depths[i], self._flag)
         had_rows = np.isin(found.group, known.group[known.within_reach])
         return replace(self._from_origin(found), within_reach=had_rows)
 

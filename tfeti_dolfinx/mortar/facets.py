@@ -47,6 +47,10 @@ class FacetElement:
         self._element = create_element(basix.ElementFamily.P, self._cell, degree, variant)
         self.points = self._element.points
         self.size = self._element.dim
+        # which vertices an edge joins; opposite ones of a quadrilateral add up to 3
+        vertex = np.arange(len(POLYGON[facet]))
+        apart = (vertex[:, None] + vertex != 3) | (facet != "quadrilateral")
+        self.neighbours = apart & (vertex[:, None] != vertex)
 
     def values(self, xi: Array) -> Array:
         """Basis functions at reference points: shape ``(n, tdim)`` to ``(n, size)``."""
@@ -95,6 +99,8 @@ class Facets:
     # second derivatives of the height of a smooth surface over the facet's tangent plane
     # (`with_curvature`), negative where the body is convex; at first 0, shape (n, gdim, gdim)
     curvature: Array
+    # whether Dirichlet conditions hold a vertex along its normal, at first not, shape (n, v)
+    held: Array
 
     def __len__(self) -> int:
         return len(self.x)
@@ -180,7 +186,23 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
         vertex_normals=np.ascontiguousarray((sign * _unit(at_vertices)).swapaxes(0, 1)),
         area=area,
         curvature=np.zeros((len(x), gdim, gdim)),
+        held=np.zeros((len(x), hats.size), dtype=bool),
     )
+
+
+def with_held_vertices(
+    facets: Facets, dofs: TornDofs, normals: Array, flag: Array | None
+) -> Facets:
+    """Return the same facets with flags of vertices that Dirichlet conditions hold. Collective.
+
+    Normals and flags of prescribed components are those of owned groups, shape ``(g, gdim)``; None:
+    nothing is prescribed.
+    """
+    if flag is None:
+        return facets
+    fixed = np.all(flag | (np.abs(normals) <= SEARCH.held), axis=1)
+    (held,) = dofs.lookup(facets.vertices.ravel(), fixed)
+    return replace(facets, held=held.reshape(facets.vertices.shape))
 
 
 def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array]:

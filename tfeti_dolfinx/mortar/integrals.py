@@ -141,6 +141,8 @@ class MortarIntegrals:
     # triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign), ψ_i the dual
     # multipliers
     entries: tuple[Triplets, ...]
+    # triplets (group of a vertex whose multiplier is a point, a neighbour's group, share of ∫φ_d)
+    shares: Triplets
 
 
 @dataclass(frozen=True)
@@ -151,12 +153,49 @@ class DualMultipliers:
     place: Array  # place in `facet` of each point's facet, shape (m,)
     weighted: Array  # weight times ψ_i at each point, shape (m, v)
     covered: Array  # ∫φ_i over the part that the points cover, shape (f, v)
+    # of ∫φ_d of a vertex d whose multiplier is a point: shares of neighbours k, shape (f, d, k)
+    shares: Array
 
     def integrals(self, values: Array) -> Array:
         """∫ψ_i f on each facet, from values of f at the points: ``(m, …)`` to ``(f, v, …)``."""
         extra = (1,) * (values.ndim - 1)
         weighted = self.weighted.reshape(*self.weighted.shape, *extra)
         return sum_rows(self.place, weighted * values[:, None], len(self.facet))
+
+    def passed_on(
+        self, kind: FacetKind, level: Array, spot: Array, vertex: Array
+    ) -> tuple[DualMultipliers, Array]:
+        """Multipliers of which those at vertices that are held have passed on to neighbours.
+
+        On each facet vertices pass on to those of the lowest level, ``(f, v)``, where all are held
+        on both sides to the first. Where there is a spot, ``vertex`` of the facet ``facet[spot]``,
+        ψ_d becomes D_d times a Dirac there, and the neighbours get the rest; else they get all of
+        it. The sum of all stays, and so do integrals of what is linear. Return also which spots are
+        points now, the last ones.
+        """
+        v, level = level.shape[1], np.array(level, dtype=float)
+        level[level.min(axis=1) > 2.0 - SEARCH.mostly, 0] -= 1.0
+        held = level > np.maximum(level.min(axis=1) + SEARCH.held, SEARCH.mostly)[:, None]
+        to = np.repeat(~held[:, :, None], v, axis=2)
+        beside = to & kind.hats.neighbours
+        to = np.where(beside.any(axis=1, keepdims=True), beside, to) & held[:, None]
+        share = to / np.maximum(to.sum(axis=1, keepdims=True), 1)
+        at = np.zeros(held.shape)
+        np.add.at(at, (spot, vertex), 1.0)
+        whole = np.where(held & (at == 0.0), self.covered, 0.0)
+        used = held[spot, vertex]
+        spot, vertex = spot[used], vertex[used]
+        dirac = np.eye(v)[vertex] - share[spot, :, vertex]
+        dirac *= (self.covered[spot, vertex] / at[spot, vertex])[:, None]
+        keeps = np.eye(v) * ~held[:, None] + share
+        weighted = np.einsum("mij,mj->mi", keeps[self.place], self.weighted)
+        return DualMultipliers(
+            facet=self.facet,
+            place=np.append(self.place, spot),
+            weighted=np.concatenate((weighted, dirac)),
+            covered=self.covered - whole + np.einsum("fij,fj->fi", share, whole),
+            shares=share.swapaxes(1, 2) * np.where(at > 0.0, self.covered, 0.0)[:, :, None],
+        ), used
 
 
 def dual_multipliers(
@@ -178,7 +217,8 @@ def dual_multipliers(
     covered[hardly] = 0.0
     dual = covered[:, :, None] * np.linalg.inv(mass)
     psi = np.einsum("mij,mj->mi", dual[place], hats)
-    return DualMultipliers(facets, place, weight[:, None] * psi, covered)
+    shares = np.zeros(mass.shape)
+    return DualMultipliers(facets, place, weight[:, None] * psi, covered, shares)
 
 
 def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
@@ -188,11 +228,20 @@ def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
 
 
 def integrate(
-    kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments
+    kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments, closed: bool
 ) -> MortarIntegrals:
-    """Return integrals of the secondary facets' dual multipliers over segments."""
+    """Return integrals of the secondary facets' dual multipliers over segments.
+
+    Surfaces are closed to each other, wherever the facets are, if gaps are given.
+    """
     at = segments.points
     dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
+    if np.any(primary.held) or (kind.displacement.degree > 1 and np.any(secondary.held)):
+        corners = segments.corners
+        level, corner, *spots = _held(kind, (secondary, primary), corners, dual.facet, closed)
+        dual, used = dual.passed_on(kind, level, *spots)
+        at = at.and_also(corners, corner[used])
+        segments = replace(segments, points=at)
     gap = curved_gap = _gaps(kind, secondary, primary, segments, dual)
     if np.any(secondary.curvature) or np.any(primary.curvature):
         curved_gap = _gaps(kind, secondary, primary, segments, dual, curved=True)
@@ -210,6 +259,7 @@ def integrate(
             triplets(secondary.vertices[dual.facet], secondary.groups[dual.facet], own),
             triplets(secondary.vertices[s], primary.groups[p], -other),
         ),
+        shares=_shares(secondary, dual),
     )
 
 
@@ -221,11 +271,52 @@ def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> Mort
     # exact for ψ_i φ_k on plane facets, and enough on curved ones
     facet, xi, weight = whole_facets(kind, facets, 4 * kind.displacement.degree)
     dual = dual_multipliers(kind, facets.area, facet, xi, weight)
+    if kind.displacement.degree > 1 and np.any(facets.held):
+        held = facets.held[dual.facet]
+        spot, vertex = np.nonzero(held)
+        dual, used = dual.passed_on(kind, 2.0 * held, spot, vertex)  # an obstacle does not bend
+        xi = np.concatenate((xi, kind.hats.points[vertex[used]]))
     at_vertices, vertices = distance[dual.facet], facets.vertices[dual.facet]
     gap = GapIntegrals(at_vertices * dual.covered, at_vertices, at_vertices)
     own = dual.integrals(kind.displacement.values(xi))
     entries = triplets(vertices, facets.groups[dual.facet], own)
-    return MortarIntegrals(vertices, dual.covered, gap, gap, (entries,))
+    return MortarIntegrals(vertices, dual.covered, gap, gap, (entries,), _shares(facets, dual))
+
+
+def _shares(facets: Facets, dual: DualMultipliers) -> Triplets:
+    """Return shares of neighbours as triplets of groups."""
+    vertices = facets.vertices[dual.facet]
+    of, to, share = triplets(vertices, vertices, dual.shares)
+    return of[share > 0.0], to[share > 0.0], share[share > 0.0]
+
+
+def _held(
+    kind: FacetKind, sides: tuple[Facets, Facets], at: FacingPoints, facet: Array, closed: bool
+) -> tuple[Array, Array, Array, Array]:
+    """On how many sides facets are held at their vertices, of those that may bend over them.
+
+    The secondary side may where its trace has a degree above 1. Both are looked at where a corner
+    of common parts is next to the vertex, the primary one by the share of its hats that is held;
+    what is far apart there counts as free, unless gaps are given. Return also the corners that are
+    at a vertex, the place of their facet, and the vertex; not where the primary side is nearly
+    held, since what moves there would do so in a row of its own.
+    """
+    secondary, primary = sides
+    place = np.searchsorted(facet, at.secondary)
+    hats = kind.hats.values(at.xi)
+    nearest = np.zeros((len(facet), hats.shape[1]))
+    np.maximum.at(nearest, place, hats)
+    near = hats > nearest[place] - SEARCH.held
+    free = np.sum(np.abs(kind.hats.values(at.eta)) * ~primary.held[at.primary], axis=1)
+    own = secondary.held[at.secondary] * (kind.displacement.degree > 1)
+    apart = np.linalg.norm(_apart(kind, secondary, primary, at, False), axis=1)
+    close = closed | (apart <= SEARCH.together * secondary.radius[at.secondary])
+    level = np.full(nearest.shape, 2.0)
+    held = (1.0 - free[:, None] + own) * close[:, None]
+    np.minimum.at(level, place, np.where(near, held, 2.0))
+    nearly = (free > SEARCH.held) & (free <= SEARCH.mostly)
+    corner, vertex = np.nonzero(near & (hats > 1.0 - SEARCH.held) & ~nearly[:, None])
+    return level, corner, place[corner], vertex
 
 
 def _gaps(
