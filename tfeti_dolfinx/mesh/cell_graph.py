@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange, offset_of
@@ -118,7 +118,9 @@ class CellGraph:
         n, comm = self.num_cells, self.comm
         across, each = self.across, np.arange(n, dtype=np.int32)[:, None]
         same, own = colour[:, None] == self.with_ghosts(colour)[across], across < n
-        count, label = _components(np.where(same & own, across, each), colour)
+        # each of two neighbours has the other: strong components are found without a transpose
+        graph = incidence(np.where(same & own, across, each), n)
+        count, label = connected_components(graph, connection="strong")
         label = self.with_ghosts(label + offset_of(comm, count))
         cell, facet = np.nonzero(same & ~own)
         edges = np.unique(np.stack((label[cell], label[across[cell, facet]])), axis=1)
@@ -144,28 +146,6 @@ class CellGraph:
         facets = np.bincount(place.ravel(), counts, minlength=len(links)).astype(np.int64)
         links = np.stack(np.divmod(links, max(count, 1)), axis=1)
         return Pieces(piece[:n], lowest[0][order], size[order], links, facets)
-
-
-def _components(across: Array, colour: Array) -> tuple[int, Array]:
-    """Return the number of components of a graph of one colour each, and that of each node.
-
-    ``across`` are the neighbours, which have a node as theirs, too, and its colour, ``(n, k)``.
-    Most often each colour has one component: a search in breadth from a node each leaves few.
-    """
-    (n, k), last = across.shape, np.full(colour.max(initial=-1) + 1, -1)
-    last[colour] = np.arange(n)
-    seeds = last[last >= 0]
-    columns = np.concatenate((across.ravel(), seeds.astype(np.int32)))
-    table = np.append(np.arange(0, n * k + 1, k), len(columns))
-    graph = csr_array((np.ones(len(columns)), columns, table), shape=(n + 1, n + 1))
-    lone = np.ones(n + 1, dtype=bool)
-    lone[breadth_first_order(graph, n, return_predecessors=False)] = False
-    label, left = (np.cumsum(last >= 0) - 1)[colour], np.flatnonzero(lone)
-    # each of two neighbours has the other: strong components are found without a transpose
-    graph = incidence((np.cumsum(lone) - 1)[across[left]], len(left))
-    count, of_left = connected_components(graph, connection="strong")
-    label[left] = len(seeds) + of_left
-    return len(seeds) + count, label
 
 
 def incidence(vertices: Array, num_nodes: int) -> csr_array:

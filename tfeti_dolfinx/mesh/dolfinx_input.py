@@ -114,7 +114,21 @@ def decompose(
     volumes = checked_names(volumes, "volumes", cell_tags, "cell_tags")
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
-        untorn = _untorn(mesh, cell_tags, facet_tags, surfaces, volumes)
+        topology = mesh.topology
+        owned = topology.index_map(topology.dim).size_local
+        untorn = UntornMesh(
+            cell_type=topology.cell_type,
+            element=mesh.ufl_domain().ufl_coordinate_element(),
+            cells=geometry_dofmap(mesh)[:owned],
+            cell_ids=original_cells(mesh)[:owned],
+            cell_tags=_values(cell_tags, np.arange(owned)),
+            facet_tags=_values(facet_tags, cell_facets(mesh)),
+            node_ids=np.asarray(mesh.geometry.input_global_indices),
+            x=mesh.geometry.x[:, : mesh.geometry.dim],
+            names=PhysicalNames(
+                _names(mesh, facet_tags, surfaces), _names(mesh, cell_tags, volumes)
+            ),
+        )
         if subdomains is None:
             subdomains = default_count(untorn, mesh.comm)
         decomposition = decomposed(untorn, subdomains, partitioner, mesh.comm)
@@ -158,30 +172,6 @@ def _located(
         values[found], names[name] = tag, tag
     indices = np.flatnonzero(values != NO_TAG).astype(np.int32)
     return names, dmesh.meshtags(mesh, dim, indices, values[indices])
-
-
-def _untorn(
-    mesh: dmesh.Mesh,
-    cell_tags: dmesh.MeshTags | None,
-    facet_tags: dmesh.MeshTags | None,
-    surfaces: dict[str, int],
-    volumes: dict[str, int],
-) -> UntornMesh:
-    topology = mesh.topology
-    owned = topology.index_map(topology.dim).size_local
-    return UntornMesh(
-        cell_type=topology.cell_type,
-        element=mesh.ufl_domain().ufl_coordinate_element(),
-        cells=geometry_dofmap(mesh)[:owned],
-        cell_ids=original_cells(mesh)[:owned],
-        cell_tags=_values(cell_tags, np.arange(owned)),
-        facet_tags=_values(facet_tags, cell_facets(mesh)),
-        node_ids=np.asarray(mesh.geometry.input_global_indices),
-        x=mesh.geometry.x[:, : mesh.geometry.dim],
-        names=PhysicalNames(
-            surfaces=_names(mesh, facet_tags, surfaces), volumes=_names(mesh, cell_tags, volumes)
-        ),
-    )
 
 
 def _checked_mesh(mesh: Any) -> dmesh.Mesh:

@@ -40,7 +40,6 @@ from tfeti_dolfinx.mesh.untorn import (
     facet_keys,
     facet_vertices,
     mix,
-    places,
     set_key,
 )
 
@@ -181,7 +180,8 @@ def untorn_mesh(
     all_ids = np.concatenate([empty.ids, *(content.node_ids for content in with_cells)])
     all_x = np.concatenate([np.empty((0, 3)), *(content.x for content in with_cells)])
     node_ids, first = np.unique(all_ids, return_index=True)
-    cells = places(node_ids, found.nodes)[:, cell_permutation(cell_type, found.nodes.shape[1])]
+    order = cell_permutation(cell_type, found.nodes.shape[1])
+    cells = np.searchsorted(node_ids, found.nodes[:, order])
     mesh = UntornMesh(
         cell_type=cell_type,
         element=element,

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import create_mesh_in_place
@@ -57,16 +56,10 @@ def moved(
     if comm.size == 1:
         return mesh, values
     # nodes that go to each rank, each once, and the places of the cells' nodes among them
-    place, table = np.empty_like(mesh.cells), np.empty(len(mesh.node_ids), dtype=np.int64)
-    cells = np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank))[:-1])
-    nodes = list[Array]()
-    for own in cells:
-        every = mesh.cells[own].ravel()
-        table[every] = np.arange(len(every))
-        nodes.append(every[table[every] == np.arange(len(every))])
-        table[nodes[-1]] = np.arange(len(nodes[-1]))
-        place[own] = table[every].reshape(-1, place.shape[1])
-    to, node = np.repeat(np.arange(len(nodes)), [len(of) for of in nodes]), np.concatenate(nodes)
+    count, rank = max(len(mesh.node_ids), 1), rank.astype(np.int64)
+    pairs, place = np.unique(rank[:, None] * count + mesh.cells, return_inverse=True)
+    to, node = np.divmod(pairs, count)
+    place = place.reshape(mesh.cells.shape) - np.searchsorted(to, rank)[:, None]
     of_cells, of_nodes = Exchange(comm, rank), Exchange(comm, to)
     node_ids, first, merged = np.unique(
         of_nodes.send(mesh.node_ids[node]), return_index=True, return_inverse=True
@@ -138,22 +131,12 @@ def tear(
     values = np.column_stack((subdomain, on_boundary))
     share, values = moved(untorn, ranks[subdomain], values, comm)
     subdomain, on_boundary = values[:, 0], values[:, 1:] > 0
-    order = np.argsort(share.cell_ids, kind="stable")  # on one rank they often ascend
-    small = subdomain[order].astype(np.min_scalar_type(len(body)))  # sorted by counting
-    order = order[np.argsort(small, kind="stable")]
-    # nodes of the torn mesh: one copy for each subdomain. Corners are sorted by counting
-    of = np.bincount(subdomain, minlength=len(body)) * share.cells.shape[1]
-    corners = csr_array(
-        (np.arange(share.cells.size), share.cells[order].ravel(), np.append(0, np.cumsum(of))),
-        shape=(len(body), len(share.node_ids)),
-    )
-    corners = corners.tocsc().tocsr()
-    node, first = corners.indices, np.ones(share.cells.size, dtype=bool)
-    first[1:] = node[1:] != node[:-1]
-    first[corners.indptr[:-1][of > 0]] = True
-    cells = np.empty(share.cells.size, dtype=np.int64)
-    cells[corners.data] = np.cumsum(first) - 1
-    node, start = node[first], offset_of(comm, np.count_nonzero(first))
+    order = np.lexsort((share.cell_ids, subdomain))
+    # nodes of the torn mesh: one copy for each subdomain
+    count = max(len(share.node_ids), 1)
+    corners = subdomain[order, None] * count + share.cells[order]
+    copies, cells = np.unique(corners, return_inverse=True)
+    node, start = copies % count, offset_of(comm, len(copies))
     cells = start + cells.reshape(share.cells.shape)
     mesh = create_mesh_in_place(comm, cells, share.x[node], share.element)
     cell = order[np.asarray(mesh.topology.original_cell_index) - offset_of(comm, len(cells))]

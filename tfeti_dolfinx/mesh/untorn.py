@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +9,6 @@ import basix
 import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scipy.sparse import csc_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange
@@ -58,29 +56,11 @@ def facet_keys(cells: Array, ids: Array, cell_type: dmesh.CellType) -> Array:
 
 
 def equal_pairs(keys: Array) -> tuple[Array, Array]:
-    """Positions of keys that occur twice: ``keys[first] == keys[second]``, first < second.
-
-    They are keys of sets: by their first bits they are sorted, by counting, into buckets of few.
-    """
-    n = len(keys)
-    bucket = (keys >> np.uint64(64 - max(n.bit_length() - 1, 1))).astype(np.int32)
-    shape = (bucket.max(initial=0) + 1, n)
-    buckets = csc_array((np.arange(n), bucket, np.arange(n + 1)), shape=shape).tocsr()
-    keys, pairs = keys[buckets.data], [np.empty((2, 0), dtype=np.int64)]
-    for apart in range(1, np.diff(buckets.indptr).max(initial=1)):
-        same = np.flatnonzero(keys[apart:] == keys[:-apart])
-        pairs.append(buckets.data[np.stack((same, same + apart))])
-    first, second = np.concatenate(pairs, axis=1)
+    """Positions of keys that occur twice: ``keys[first] == keys[second]``, first < second."""
+    order = np.argsort(keys)
+    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    first, second = np.sort((order[same], order[same + 1]), axis=0)
     return first, second
-
-
-def places(known: Array, ids: Array) -> Array:
-    """Places of ids, of any shape, in an ascending array that has all of them."""
-    if len(known) and known[-1] - known[0] < 4 * ids.size:
-        table = np.empty(known[-1] - known[0] + 1, dtype=np.int64)
-        table[known - known[0]] = np.arange(len(known))
-        return table[ids - known[0]]
-    return np.searchsorted(known, ids)
 
 
 def exchange_by_key(comm: MPI.Intracomm, keys: Array) -> Exchange:
@@ -135,13 +115,8 @@ class UntornMesh:
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        return np.stack([c.sum(axis=0) for c in self._corners()]).T / self.vertices.shape[1]
+        return self.x[self.vertices].sum(axis=1) / self.vertices.shape[1]
 
     def extents(self) -> Array:
         """Sides of each cell's box along the axes, shape ``(n, gdim)``."""
-        return np.stack([np.ptp(c, axis=0) for c in self._corners()]).T
-
-    def _corners(self) -> Iterator[Array]:
-        """Give one coordinate after the other of the vertices, shape ``(vertices_per_cell, n)``."""
-        vertices = np.ascontiguousarray(self.vertices.T)
-        yield from (np.ascontiguousarray(c)[vertices] for c in self.x.T)
+        return np.ptp(self.x[self.vertices], axis=1)
