@@ -13,10 +13,26 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.constraints.contact_state import ContactState, ContactStatus, Multipliers
+from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.validation import is_whole, shown
+from tfeti_dolfinx.constraints.contact_state import (
+    ContactData,
+    ContactStatus,
+    Multipliers,
+    ToolState,
+)
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.partner import ContactPartner
-from tfeti_dolfinx.contact.records import Resultant, body_forces, vertex_tractions
+from tfeti_dolfinx.contact.partner import ContactPartner, position_of
+from tfeti_dolfinx.contact.records import (
+    Resultant,
+    body_forces,
+    condition_areas,
+    relative_displacement,
+    resultant,
+    vertex_tractions,
+)
+from tfeti_dolfinx.contact.rigid_body import rotation_vector
+from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin
 from tfeti_dolfinx.forms.fields import (
@@ -29,7 +45,7 @@ from tfeti_dolfinx.forms.fields import (
     vector_from_vertices,
     von_mises,
 )
-from tfeti_dolfinx.mortar.facets import hat_integrals
+from tfeti_dolfinx.mortar.facets import facet_nodes, group_points, hat_integrals, surface_facets
 
 # --- Displacement and stress at given points --------------------------------------------------
 
@@ -71,7 +87,7 @@ def value_row(u: Array, stress: Array) -> Array:
 # --- The solution -----------------------------------------------------------------------------
 
 
-class Solution(ContactState):
+class Solution:
     """Solution of a contact problem; fields are made when they are first asked for.
 
     It owns its data, the constants and functions in the stress too: a later solve of the same
@@ -90,6 +106,8 @@ class Solution(ContactState):
         has_contact: True if the problem has contacts.
         has_friction: True if a contact of the problem has friction.
         tool_motions: Where rigid bodies are.
+        thickness: What areas are multiplied with, a number or a scalar in UFL.
+        finite: True where forces act at X + u, as in finite strain.
     """
 
     def __init__(
@@ -101,12 +119,19 @@ class Solution(ContactState):
         stress: Stress | None = None,
         thickness: Any = 1.0,
     ) -> None:
-        super().__init__(u, multipliers, gluing, contacts, frozen(thickness))
+        self.u, self.lam = u, multipliers.lam
+        self.carrying, self.holding = multipliers.face.carrying, multipliers.face.holding
+        self.gluing, self.dofs, self.decomposition = gluing, gluing.dofs, gluing.dofs.decomposition
+        self.contacts, self.thickness = list(contacts), frozen(thickness)
+        self.tool_motions: Sequence[ToolMotion] = ()
+        self.finite = False
         self.v: Array | None = None
         self.boundary: Any = None
         self._stress_of, self.has_stress = stress, stress is not None
         self.has_contact = bool(contacts)
         self.has_friction = any(contact.friction is not None for contact in contacts)
+
+    # ------------------------------------------------------------------- fields
 
     @cached_property
     def displacement(self) -> fem.Function:
@@ -317,3 +342,222 @@ class Solution(ContactState):
         function = from_vertices(self.dofs, values, self._vertices)
         function.name = name
         return function
+
+    # ---------------------------------------- contacts, conditions, rigid bodies
+
+    def places(self) -> Array:
+        """Points where forces on the owned groups act, shape ``(g, 3)``. Collective."""
+        points = group_points(self.dofs)
+        if self.finite and self.dofs.nodes is None:  # else nodes have moved there
+            moved = np.zeros((self.dofs.num_nodes, 3))
+            moved[:, : self.dofs.bs] = self.u.reshape(-1, self.dofs.bs)
+            points += self.dofs.reduce(moved, np.minimum)
+        return points
+
+    def contact(self, which: int | str = 0) -> ContactData:
+        """State of the nodes of a contact, those that this rank owns. Collective.
+
+        Args:
+            which: Position in the list of contacts, or name.
+
+        Raises:
+            InputError: There is no such contact, or several have the name.
+        """
+        with agreeing(self.dofs.comm, "contact") as given:
+            names = [contact.name for contact in self.contacts]
+            position = given["contact"] = position_of(names, which)
+        records = self.gluing.records
+        own = records.contact == position
+        points, places = (x[records.group[own]] for x in (group_points(self.dofs), self.places()))
+        area = self.area[:, None]
+        traction = np.divide(
+            self.tangential_force, area, out=0.0 * self.tangential_force, where=area > 0.0
+        )
+        return ContactData(
+            points=points,
+            normal=records.normal[own],
+            force=self.force[own],
+            pressure=self.contact_pressure[own],
+            area=self.area[own],
+            gap=self.remaining_gap[own],
+            status=self.status_of_conditions[own],
+            tangential_traction=traction[own],
+            slip=self.slip_of_conditions[own],
+            surface=self.contacts[position].surfaces[0],
+            resultant=resultant(self.dofs.comm, places, self.condition_forces[own]),
+        )
+
+    def tool(self, which: int | str = 0) -> ToolState:
+        """Return motion and forces of a rigid body. Collective.
+
+        Args:
+            which: Position among the rigid bodies, or name.
+
+        Raises:
+            InputError: There is no such body.
+        """
+        names = [tool.name for tool in self.tool_motions]
+        with agreeing(self.dofs.comm, "tool") as given:
+            if which in names:
+                which = names.index(str(which))
+            if not is_whole(which) or not 0 <= which < len(names):
+                raise InputError(f"tool {shown(which)}: expected one of {names}, or its position")
+            given["tool"] = which
+        tool, records = self.tool_motions[which], self.gluing.records
+        gdim, own = len(tool.centre), np.isin(records.contact, tool.contacts)
+        arm = np.zeros((int(np.sum(own)), 3))
+        arm[:, :gdim] = records.place[own] - tool.centre
+        return ToolState(
+            name=tool.name,
+            displacement=tool.motion[:gdim],
+            rotation=rotation_vector(tool.motion, gdim),
+            resultant=resultant(self.dofs.comm, arm, -self.condition_forces[own]),
+        )
+
+    def reaction(self, surface: str | int) -> Resultant:
+        """Return the force and moment by which Dirichlet conditions hold a surface. Collective.
+
+        Contact forces are not in it. Of a node that two surfaces share, both have the whole force.
+        Of bodies with mass it is the mean of the step.
+
+        Args:
+            surface: Name or tag.
+
+        Raises:
+            InputError: The surface is unknown, has no facets, or lies inside a body.
+        """
+        with agreeing(self.dofs.comm, "reaction") as given:
+            given["surface"] = self.decomposition.surface(surface)
+        facets = surface_facets(self.decomposition, surface)
+        member = np.zeros(self.dofs.num_nodes, dtype=bool)
+        member[facet_nodes(self.dofs, facets)] = True
+        groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or))
+        # −Bᵀλ, summed over the copies of a node, less the contact forces: gluing forces cancel
+        constraints = self.gluing.constraints
+        own = constraints.trace < len(self.u)  # those behind are of rigid bodies
+        forces = np.zeros_like(self.u)
+        forces[constraints.trace[own]] = -constraints.forces(self.lam)[own]
+        total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add)
+        force = (total - self.nodal_forces)[groups]
+        return resultant(self.dofs.comm, self.places()[groups], force)
+
+    @cached_property
+    def force(self) -> Array:
+        """Normal force s_i λ_i of each contact condition of this rank. Collective at first use.
+
+        It is 0 without a constraint, but where held vertices touch: they bear what their neighbours
+        do.
+        """
+        rows, records = self.gluing.contact, self.gluing.records
+        force = np.zeros(len(records))
+        force[rows.condition] = rows.scale * self.lam[self.gluing.constraints.sets.normals]
+        if not any_rank(self.dofs.comm, len(records.held) > 0):
+            return force
+        pressure = np.divide(force, self.area, out=0.0 * force, where=self.area > 0.0)
+        beside = np.zeros(len(records.held))
+        for contact in range(len(self.contacts)):
+            own, of = records.contact == contact, records.contact[records.held] == contact
+            known = np.zeros(self.dofs.num_groups)
+            known[records.group[own]] = pressure[own]
+            (beside[of],) = self.dofs.lookup(records.beside[of], known)
+        at = self.gluing.closed()
+        force[at] = (sum_rows(records.held, records.share * beside, len(records)) * self.area)[at]
+        return force
+
+    @cached_property
+    def tangential_force(self) -> Array:
+        """Friction on the node of each contact condition of this rank, shape ``(n, gdim)``."""
+        rows, records = self.gluing.tangents, self.gluing.records
+        lam = self.lam[self.gluing.constraints.sets.tangents]
+        force = np.zeros(records.normal.shape)
+        along = np.einsum("tk,tkg->tg", lam, records.tangents[rows.condition])
+        force[rows.condition] = -rows.scale[:, None] * along
+        return force
+
+    @cached_property
+    def contact_pressure(self) -> Array:
+        """Force over area of each contact condition of this rank. Collective at first use."""
+        return np.divide(self.force, self.area, out=0.0 * self.force, where=self.area > 0.0)
+
+    @cached_property
+    def area(self) -> Array:
+        """∫φ_i times the thickness of each contact condition of this rank. Collective at first use.
+
+        Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
+        """
+        surfaces = [contact.surfaces[0] for contact in self.contacts]
+        return condition_areas(self.gluing.records, self.dofs, surfaces, self.thickness)
+
+    @cached_property
+    def remaining_gap(self) -> Array:
+        """Gap after deformation of each contact condition of this rank. Collective at first use."""
+        return self.gluing.records.gap - self._motion[0]
+
+    @cached_property
+    def _motion(self) -> tuple[Array, Array]:
+        """The v_i along normals, ``(n,)``, and tangents, ``(n, gdim - 1)``. Collective at first."""
+        records = self.gluing.records
+        v = relative_displacement(records, self.dofs, self.u)
+        return np.sum(records.normal * v, axis=1), np.einsum("ntg,ng->nt", records.tangents, v)
+
+    @cached_property
+    def slip_of_conditions(self) -> Array:
+        """Change of the tangential v_i of each condition in this step, a vector.
+
+        Shape ``(n, gdim)``. Collective at first use.
+        """
+        records = self.gluing.records
+        return np.einsum("nt,ntg->ng", self._motion[1] - self.gluing.slip, records.tangents)
+
+    @cached_property
+    def slip_at_end(self) -> Array:
+        """Tangential v_i of each condition at the end of the step, shape ``(n, gdim - 1)``.
+
+        Of a node that sticks it is what it was: else a step would take the algebraic error of the
+        one before for a slip. Collective at first use.
+        """
+        gluing, rows = self.gluing, self.gluing.tangents
+        at, end = gluing.constraints.sets.tangents, self._motion[1]
+        rubs = np.any(self.lam[at] != 0.0, axis=1) & np.all(self.holding[at] | ~rows.moves, axis=1)
+        kept = np.zeros(end.shape, dtype=bool)
+        kept[rows.condition] = rubs[:, None] & rows.moves
+        return np.where(kept, gluing.slip, end)
+
+    @cached_property
+    def dissipation(self) -> Array:
+        """Energy that friction dissipates at each condition in this step, shape ``(n,)``.
+
+        −F·s, F the friction on the node and s its slip. Collective at first use.
+        """
+        return -np.sum(self.tangential_force * self.slip_of_conditions, axis=1)
+
+    @cached_property
+    def status_of_conditions(self) -> Array:
+        """ContactStatus of each contact condition of this rank."""
+        gluing, sets = self.gluing, self.gluing.constraints.sets
+        status = np.full(len(gluing.records), ContactStatus.OPEN)
+        touching = gluing.contact.condition[self.carrying[sets.normals]]
+        status[touching] = ContactStatus.TOUCHING
+        decided = gluing.contact.decided
+        status[decided[self.force[decided] > 0.0]] = ContactStatus.TOUCHING
+        rows = gluing.tangents
+        held = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
+        rubbing = np.where(held, ContactStatus.STICK, ContactStatus.SLIP)
+        closed = np.isin(rows.condition, np.concatenate((touching, decided)))
+        status[rows.condition[closed]] = rubbing[closed]
+        return status
+
+    @cached_property
+    def condition_forces(self) -> Array:
+        """Force on the node of each contact condition of this rank, shape ``(n, gdim)``."""
+        return self.tangential_force - self.force[:, None] * self.gluing.records.normal
+
+    @cached_property
+    def nodal_forces(self) -> Array:
+        """Contact forces Σ_i w_ij F_i on the owned groups. Collective at first use.
+
+        Shape ``(g, gdim)``, of both sides.
+        """
+        records = self.gluing.records
+        shares = records.weight[:, None] * self.condition_forces[records.condition]
+        return self.dofs.reduce_on_owners(records.entry_group, shares)
