@@ -55,28 +55,23 @@ class Sizes:
         """Count rows and unknowns, ``inside`` of which boundary elements do without. Collective."""
         dofs, constraints, records = gluing.dofs, gluing.constraints, gluing.records
         comm, decomposition = dofs.comm, dofs.decomposition
-        own = (
-            constraints.num_rows,
-            len(constraints.sets.normals),
-            records.candidates,
-            records.candidates - int(np.sum(records.within_reach)),
-            len(gluing.contact.decided),
-            constraints.sets.tangents.size,
-        )
-        rows, normals, candidates, far, dropped, tangents = map(int, summed(comm, np.array(own)))
+        own = {
+            "dual_dofs": constraints.num_rows,
+            "contact_rows": len(constraints.sets.normals),
+            "contact_candidates": records.candidates,
+            "far_contact_nodes": records.candidates - int(np.sum(records.within_reach)),
+            "dropped_contact_rows": len(gluing.contact.decided),
+            "tangential_rows": constraints.sets.tangents.size,
+        }
+        total = summed(comm, np.array(list(own.values())))
         return cls(
             ranks=comm.size,
             primal_dofs=int(dofs.offsets[-1]) * dofs.bs - inside,
-            dual_dofs=rows,
             subdomains=decomposition.num_subdomains,
             bodies=decomposition.num_bodies,
             split_subdomains=len(decomposition.split),
-            contact_rows=normals,
-            contact_candidates=candidates,
-            far_contact_nodes=far,
             unmet_contacts=unmet,
-            dropped_contact_rows=dropped,
-            tangential_rows=tangents,
+            **dict(zip(own, map(int, total), strict=True)),
         )
 
 

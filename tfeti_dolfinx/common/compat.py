@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -135,14 +134,3 @@ def space_of(bc: fem.DirichletBC) -> Any:
     """C++ space of a Dirichlet condition."""
     space = bc.function_space
     return getattr(space, "_cpp_object", space)
-
-
-def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:
-    """Return values that conditions prescribe, NaN elsewhere, shape ``(len(bcs), size)``.
-
-    ``size`` is the number of local unrolled dofs.
-    """
-    values = np.full((len(bcs), size), np.nan)
-    for row, bc in zip(values, bcs, strict=True):
-        bc.set(row)
-    return values

@@ -11,7 +11,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import prescribed_values, space_of
+from tfeti_dolfinx.common.compat import space_of
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.constraints.contact_rows import (
@@ -117,7 +117,9 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     Raise an InputError where conditions contradict each other at a node, or are not finite.
     """
     size = dofs.V.dofmap.index_map.size_local * dofs.bs
-    values = prescribed_values(bcs, size)
+    values = np.full((len(bcs), size), np.nan)
+    for row, bc in zip(values, bcs, strict=True):
+        bc.set(row)
     low = np.fmin.reduce(values, axis=0, initial=np.inf)
     high = np.fmax.reduce(values, axis=0, initial=-np.inf)
     low = dofs.reduce(dofs.to_primal(low).reshape(-1, dofs.bs), np.minimum)

@@ -75,7 +75,10 @@ class CoarseSpace(Coarse):
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         Gt = transposed_G(B, kernel, dimension)
-        self.row_size = _sizes(B)
+        indptr, _, data = B.getValuesCSR()
+        row = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+        sizes = np.bincount(row, np.abs(data), minlength=len(indptr) - 1).astype(float)
+        self.row_size = np.where(sizes > 0.0, sizes, 1.0)
         self.bodies = Bodies(subdomains)
         self.J = self._on_bodies(Gt)
         equalities = np.ones(len(self.row_size), dtype=bool)
@@ -188,14 +191,6 @@ class CoarseSpace(Coarse):
             if grams is not None:
                 found = unresisted(grams, space, below)
         return cast(Motions, bcast_from_root(self.comm, found))
-
-
-def _sizes(B: PETSc.Mat) -> Array:
-    """Return the sum of the moduli of each local row, 1 where that is 0."""
-    indptr, _, data = B.getValuesCSR()
-    rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-    sizes = np.bincount(rows, np.abs(data), minlength=len(indptr) - 1).astype(float)
-    return np.where(sizes > 0.0, sizes, 1.0)
 
 
 def transposed_G(B: PETSc.Mat, kernel: csr_array, dimension: int) -> csr_array:

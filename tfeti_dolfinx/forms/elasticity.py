@@ -89,7 +89,12 @@ class Elasticity:
         self.on, self.mesh = on, on.mesh if isinstance(on, Decomposition) else on
         with agreeing(self.mesh.comm, "Elasticity") as given:
             given |= {"E": E, "nu": nu, "model": model, "thickness": thickness}
-            self.model = _checked_model(model, self.mesh.geometry.dim)
+            gdim = self.mesh.geometry.dim
+            name = "3d" if model is None and gdim == 3 else model
+            if not isinstance(name, str) or name not in MODELS.get(gdim, ()):
+                known = ", ".join(map(repr, MODELS.get(gdim, ()))) or "a mesh in 2D or 3D"
+                raise InputError(f"model={shown(model)}: expected in {gdim}D one of {known}")
+            self.model: str = name
             if thickness is not None and not self.model.startswith("plane"):
                 raise InputError(
                     f"thickness={shown(thickness)}: expected none with model={self.model!r}; it "
@@ -154,25 +159,22 @@ class Elasticity:
         """
         made_of = (u, self.E, self.nu, self.mu)
         if not all(a is b for a, b in zip(made_of, self._made_of, strict=True)):
-            self._made_of, self._stress = made_of, self._hooke(u)
-        return self._stress
-
-    def _hooke(self, u: Any) -> Any:
-        """Make the stress of a displacement."""
-        e, E, nu, mu = self.strain(u), self.E, self.nu, self.mu
-        if self.model != "plane_stress":
+            e, E, nu, mu = self.strain(u), self.E, self.nu, self.mu
             lmbda = E * nu / (1 + nu) / (1 - 2 * nu)
-            return 2 * mu * e + lmbda * ufl.tr(e) * ufl.Identity(3)
-        # λ such that σ_zz = 0 is an exact zero, which UFL drops
-        lmbda = E * nu / (1 - nu**2)
-        pressure = lmbda * (e[0, 0] + e[1, 1])
-        return ufl.as_tensor(
-            [
-                [2 * mu * e[0, 0] + pressure, 2 * mu * e[0, 1], 0],
-                [2 * mu * e[1, 0], 2 * mu * e[1, 1] + pressure, 0],
-                [0, 0, 0],
-            ]
-        )
+            sigma = 2 * mu * e + lmbda * ufl.tr(e) * ufl.Identity(3)
+            if self.model == "plane_stress":
+                # λ such that σ_zz = 0 is an exact zero, which UFL drops
+                lmbda = E * nu / (1 - nu**2)
+                pressure = lmbda * (e[0, 0] + e[1, 1])
+                sigma = ufl.as_tensor(
+                    [
+                        [2 * mu * e[0, 0] + pressure, 2 * mu * e[0, 1], 0],
+                        [2 * mu * e[1, 0], 2 * mu * e[1, 1] + pressure, 0],
+                        [0, 0, 0],
+                    ]
+                )
+            self._made_of, self._stress = made_of, sigma
+        return self._stress
 
     def a(self, u: Any, v: Any, dx: ufl.Measure | None = None) -> ufl.Form:
         """The bilinear form ∫σ(u):ε(v) over the volume: times ``thickness``, 2πr if axisymmetric.
@@ -199,15 +201,6 @@ class Elasticity:
             dx = ufl.Measure("dx", domain=self.mesh, metadata=degree)
         checked_type(dx, ufl.Measure, "dx", "a measure of UFL, or None")
         return work * dx if isinstance(self.thickness, float) else self.thickness * work * dx
-
-
-def _checked_model(model: Any, gdim: int) -> str:
-    if model is None and gdim == 3:
-        return "3d"
-    if not isinstance(model, str) or model not in MODELS.get(gdim, ()):
-        known = ", ".join(repr(name) for name in MODELS.get(gdim, ())) or "a mesh in 2D or 3D"
-        raise InputError(f"model={shown(model)}: expected in {gdim}D one of {known}")
-    return model
 
 
 def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Range) -> Any:

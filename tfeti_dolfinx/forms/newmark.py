@@ -65,6 +65,9 @@ class Inertia:
     at its end.
     """
 
+    # of the sum of the diagonal: up to it the mass of a translation is 0, as where M has a kernel
+    _rounding = 1e-10
+
     def __init__(
         self,
         mass: ufl.Form,
@@ -118,7 +121,16 @@ class Inertia:
         if self._M is None:
             M = assemble_csr(self._m)
             with raised_on_all_ranks(self._comm):
-                check_mass(M, self._V.dofmap.index_map_bs)
+                check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
+                for k in range(bs := self._V.dofmap.index_map_bs):
+                    along = np.zeros(M.shape[0])
+                    along[k::bs] = 1.0
+                    total, sizes = along @ (M @ along), M.diagonal() @ along
+                    if total <= self._rounding * sizes and len(along):
+                        raise InputError(
+                            f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; "
+                            "expected a density, or a form such as ∫ρ u·v"
+                        )
             self._M = M
         return self._M
 
@@ -183,24 +195,6 @@ class InertialForms(Forms):
     def elastic(self, u: Array) -> float:
         """Return this rank's part of uᵀKu/2."""
         return float(0.5 * u @ (self.K @ u))
-
-
-def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:
-    """Raise an InputError unless this rank's matrix is that of a mass in every direction.
-
-    ``rounding`` is the share of the sum of the diagonal up to which the mass of a translation is 0,
-    as where M has a kernel.
-    """
-    check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
-    for k in range(bs):
-        along = np.zeros(M.shape[0])
-        along[k::bs] = 1.0
-        total, sizes = along @ (M @ along), M.diagonal() @ along
-        if total <= rounding * sizes and len(along):
-            raise InputError(
-                f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; expected a "
-                "density, or a form such as ∫ρ u·v"
-            )
 
 
 def check_copies(values: Array, dofs: TornDofs, name: str, left: float = 1e-3) -> None:

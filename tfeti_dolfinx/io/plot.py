@@ -48,6 +48,12 @@ FIELDS = {
     "status": "status",
     "bodies": "bodies",
 }
+# by status, its name and colour
+STATUS = {
+    ContactStatus.OPEN: ("open", "lightgrey"),
+    ContactStatus.SLIP: ("slip", "tab:orange"),
+    ContactStatus.STICK: ("stick", "tab:blue"),
+}
 # around the bodies, of their size; and points along an axis, for obstacles
 MARGIN, SAMPLES = 0.08, {2: 401, 3: 61}
 
@@ -196,9 +202,22 @@ def plot_pressure(
     parts = comm.gather((x, data.pressure), root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
+            from matplotlib.figure import Figure
+
             x, p = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-            labels = label, f"contact pressure [{unit}]" if unit else "contact pressure"
-            _draw_curve(target, x, p, closed_form, limit, labels)
+            near = np.abs(x) <= (np.abs(x).max(initial=0.0) if limit is None else limit)
+            order = np.argsort(x[near])
+            x, p = x[near][order], p[near][order]
+            figure = Figure(figsize=(7, 4.5), dpi=170, layout="constrained")
+            axes = figure.subplots()
+            axes.plot(x, p, "o", markersize=3, label="computed")
+            if closed_form is not None:
+                fine = np.linspace(x.min(), x.max(), 801)
+                axes.plot(fine, closed_form(fine), "-", linewidth=1, label="closed form")
+            axes.set(xlabel=label, ylabel=f"contact pressure [{unit}]".removesuffix(" []"))
+            axes.legend()
+            with written_whole(target) as partial:
+                figure.savefig(partial)
     return target
 
 
@@ -263,8 +282,30 @@ def plot_friction(
     parts = comm.gather([(*row, d.status) for row, d in zip(rows, data, strict=True)], root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
+            from matplotlib.figure import Figure
+
             whole = [np.concatenate(part) for part in zip(*chain.from_iterable(parts), strict=True)]
-            _draw_status(target, whole[0][:, axes], whole[1][:, axes], whole[2], labels)
+            x, arrows, status = whole[0][:, axes], whole[1][:, axes], whole[2]
+            figure = Figure(figsize=(8, 5), layout="constrained")
+            plot = figure.subplots()
+            length = np.linalg.norm(arrows, axis=1)
+            size = np.quantile(length, 0.95) if len(x) else 0.0
+            if size > 0.0:
+                arrows = arrows / np.maximum(length / (2.0 * size), 1.0)[:, None]
+                scale = 14.0 * size / np.linalg.norm(np.ptp(x, axis=0))
+                look = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.0015}
+                plot.quiver(*x.T, *arrows.T, **look)
+                plot.update_datalim(x + arrows / scale)
+            for value, (name, colour) in STATUS.items():
+                if np.any(at := status == value):
+                    here = f"{name}: {at.sum()}"
+                    plot.plot(*x[at].T, "o", markersize=3, color=colour, label=here)
+            plot.set_aspect("equal")
+            plot.margins(0.15)
+            plot.set(xlabel=labels[0], ylabel=labels[1])
+            plot.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+            with written_whole(target) as partial:
+                figure.savefig(partial, bbox_inches="tight")
     return target
 
 
@@ -382,60 +423,3 @@ def _draw(target: Path, data: dict[str, object]) -> None:
                     "Xvfb (Debian: apt-get install xvfb) or VTK 9.5"
                 )
             raise TfetiError(f"{target} could not be drawn:\n{result.stderr[-2000:]}")
-
-
-STATUS = {
-    ContactStatus.OPEN: ("open", "lightgrey"),
-    ContactStatus.SLIP: ("slip", "tab:orange"),
-    ContactStatus.STICK: ("stick", "tab:blue"),
-}
-
-
-def _draw_status(
-    target: Path, x: Array, arrows: Array, status: Array, labels: tuple[str, str]
-) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.subplots()
-    length = np.linalg.norm(arrows, axis=1)
-    size = np.quantile(length, 0.95) if len(x) else 0.0
-    if size > 0.0:
-        arrows = arrows / np.maximum(length / (2.0 * size), 1.0)[:, None]
-        scale = 14.0 * size / np.linalg.norm(np.ptp(x, axis=0))
-        axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=scale, width=0.0015)
-        axes.update_datalim(x + arrows / scale)
-    for value, (name, colour) in STATUS.items():
-        at = status == value
-        if np.any(at):
-            axes.plot(*x[at].T, "o", markersize=3, color=colour, label=f"{name}: {at.sum()}")
-    axes.set_aspect("equal")
-    axes.margins(0.15)
-    axes.set(xlabel=labels[0], ylabel=labels[1])
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    with written_whole(target) as partial:
-        figure.savefig(partial, bbox_inches="tight")
-
-
-def _draw_curve(
-    target: Path,
-    x: Array,
-    p: Array,
-    closed_form: Callable[[Array], Array] | None,
-    limit: float | None,
-    labels: tuple[str, str],
-) -> None:
-    from matplotlib.figure import Figure
-
-    shown = np.abs(x) <= (limit if limit is not None else np.abs(x).max(initial=0.0))
-    order = np.argsort(x[shown])
-    figure = Figure(figsize=(7, 4.5), dpi=170, layout="constrained")
-    axes = figure.subplots()
-    axes.plot(x[shown][order], p[shown][order], "o", markersize=3, label="computed")
-    if closed_form is not None:
-        fine = np.linspace(x[shown].min(), x[shown].max(), 801)
-        axes.plot(fine, closed_form(fine), "-", linewidth=1, label="closed form")
-    axes.set(xlabel=labels[0], ylabel=labels[1])
-    axes.legend()
-    with written_whole(target) as partial:
-        figure.savefig(partial)

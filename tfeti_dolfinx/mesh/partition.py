@@ -103,16 +103,6 @@ def default_count(mesh: UntornMesh, comm: MPI.Intracomm) -> int:
     return max(1, round(comm.allreduce(len(mesh.cells)) * per_cell / UNKNOWNS))
 
 
-def checked_number(number: int, mesh: UntornMesh, comm: MPI.Intracomm) -> int:
-    """Return a number of subdomains; raise an InputError unless there are so many cells."""
-    total = comm.allreduce(len(mesh.cells))
-    if not 1 <= number <= total:
-        raise InputError(
-            f"subdomains={number}: expected between 1 and {total}, the number of cells"
-        )
-    return int(number)
-
-
 def given_subdomains(mesh: UntornMesh, subdomains: Subdomains, comm: MPI.Intracomm) -> Array:
     """Subdomain of each local cell, numbered 0, 1, ... without holes. Collective.
 

@@ -20,7 +20,6 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.partition import (
     DEFAULT,
     Subdomains,
-    checked_number,
     connected_parts,
     given_subdomains,
     make_parts,
@@ -93,7 +92,12 @@ def decomposed(
 
     ``spread`` shares out the cells among ranks at first, where one rank has read them.
     """
-    number = checked_number(subdomains, untorn, comm) if is_whole(subdomains) else 0
+    total = comm.allreduce(len(untorn.cells))
+    number = int(subdomains) if is_whole(subdomains) else 0
+    if is_whole(subdomains) and not 1 <= number <= total:
+        raise InputError(
+            f"subdomains={number}: expected between 1 and {total}, the number of cells"
+        )
     if number == 0 and partitioner != DEFAULT:
         raise InputError(
             f"partitioner={shown(partitioner)} with the subdomain of each cell; expected the "

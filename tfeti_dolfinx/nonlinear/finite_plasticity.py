@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.nonlinear.hyperelasticity import displacement_gradient
-from tfeti_dolfinx.nonlinear.materials import IsotropicHardening, Plasticity, check_return
+from tfeti_dolfinx.nonlinear.materials import IsotropicHardening, Plasticity
 from tfeti_dolfinx.nonlinear.state import LawVariables
 
 # entries of the deformation gradient that a model has, and of a symmetric tensor
@@ -99,9 +99,8 @@ class FiniteJ2Plasticity(Plasticity):
         for k, (i, j) in enumerate(SYMMETRIC):
             inverse_plastic[:, i, j] = inverse_plastic[:, j, i] = components[:, k]
         hardening = self.hardening()
-        point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, hardening)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
-            check_return(point.solved, hardening)
+            point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, hardening)
         P, dP = point.P, point.tangent(self._entries)
         P[out] = dP[out] = np.nan
         dilatation = np.log(np.linalg.det(F))
@@ -173,7 +172,7 @@ class _Return:
         self.strain = 0.5 * np.log(self.b)
         s = 2.0 * mu[:, None] * (self.strain - self.strain.mean(axis=1, keepdims=True))
         q = np.sqrt(1.5 * np.sum(s**2, axis=1))
-        self.dp, self.slope, self.solved = hardening.returned(q, mu, p)
+        self.dp, self.slope = hardening.returned(q, mu, p)
         q = np.maximum(q, hardening.tolerances.yielding * hardening.yield_stress)
         self.share = 1.0 - 3.0 * mu * self.dp / q
         self.regular = hardening.regularisation * (self.dp > 0.0)

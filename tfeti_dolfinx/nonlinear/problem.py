@@ -439,7 +439,7 @@ class NonlinearContactProblem(ContactProblem):
 
     def _check_state(self, state: SavedState) -> None:
         super()._check_state(state)
-        expected = sum(len(value) for value in self._state.values())
+        expected = sum(len(function.x.array) for function in self._state.functions)
         if state.internal.size != expected or len(state.internal) != len(state.cells):
             raise InputError(
                 f"the state has {state.internal.size} values of internal variables on this rank; "

@@ -71,15 +71,6 @@ class InternalVariables:
         """The functions, in the order in which they were given."""
         return [function for function, _ in self._new]
 
-    def values(self) -> list[Array]:
-        """Return copies of the present values."""
-        return [np.array(function.x.array) for function in self.functions]
-
-    def set(self, values: list[Array]) -> None:
-        """Set values that ``values`` has returned."""
-        for function, value in zip(self.functions, values, strict=True):
-            function.x.array[:] = value
-
     def in_cells(self) -> Array:
         """Return the present values, cell by cell, shape ``(cells, w)``."""
         return np.hstack([_of_cells(function) for function in self.functions])
@@ -109,7 +100,8 @@ class InternalVariables:
                         f"not finite; expected finite numbers of shape {function.x.array.shape}"
                     )
                 found.append(new)
-        self.set(found)
+        for function, new in zip(self.functions, found, strict=True):
+            function.x.array[:] = new
 
 
 def check_state(update: Any, state: Any) -> None:

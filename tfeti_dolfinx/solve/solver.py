@@ -106,7 +106,10 @@ def solve_dual(
     cite("tfeti", qp_type)
     solver = SOLVERS[qp_type]
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
-    begin = _start(start, qp)
+    begin = None
+    if start is not None and any_rank(qp.coarse.comm, start[0]):
+        lam, mu = start  # of another kernel μ says nothing
+        begin = Start(lam, np.array(mu) if len(mu) == qp.coarse.dimension else None)
     homogenised = _homogenise(dual, qp, solver, begin)
     # of a set of one's own solvability knows which rows pull, not how much they bear
     given = dual.law is not contact_set and solver.cold is not None
@@ -137,14 +140,6 @@ def solve_dual(
     if result.reason <= 0:
         rule.examine_stopped(result)
     return result, rule
-
-
-def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
-    """Return the solver's start, none from 0; μ is None if the given one is of another kernel."""
-    if values is None or not any_rank(qp.coarse.comm, values[0]):
-        return None
-    lam, mu = values
-    return Start(lam, np.array(mu) if len(mu) == qp.coarse.dimension else None)
 
 
 def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:

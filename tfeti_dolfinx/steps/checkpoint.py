@@ -268,11 +268,23 @@ class Checkpoint:
                     with np.load(file) as contents:
                         found[rank] = dict(contents)
         places = [(rank_of[s], subdomains[rank_of[s]].index(s)) for s in self._subdomains]
-        return {
-            name: _joined(name, self._subdomains, places, found)
-            for name in next(iter(found.values()))
-            if not name.endswith(COUNTS)
-        }
+        table: Table = {}
+        first = next(iter(found.values()))
+        for name in (name for name in first if not name.endswith(COUNTS)):
+            table[name] = first[name], None
+            if any(name + COUNTS not in arrays for arrays in found.values()):
+                continue
+            # rows by subdomains, each at a place in a file, and their labels
+            pieces = {
+                rank: np.split(arrays[name], np.cumsum(arrays[name + COUNTS])[:-1])
+                for rank, arrays in found.items()
+            }
+            rows = [pieces[rank][place] for rank, place in places]
+            labels = [np.zeros(0, dtype=np.int64)]
+            for s, part in zip(self._subdomains, rows, strict=True):
+                labels.append((s << SHIFT) + np.arange(len(part)))
+            table[name] = np.concatenate([first[name][:0], *rows]), np.concatenate(labels)
+        return table
 
     def _commit(self, index: Index) -> None:
         """Let an index count."""
@@ -317,26 +329,6 @@ class Checkpoint:
         if found["version"] != VERSION:
             raise InputError(f"{file} is of version {found['version']}; expected {VERSION}")
         return Index(**found)
-
-
-def _joined(
-    name: str,
-    subdomains: list[int],
-    places: list[tuple[int, int]],
-    files: dict[int, dict[str, Array]],
-) -> tuple[Array, Array | None]:
-    """Return rows of an array by subdomains, each at a place in a file, and their labels."""
-    first = next(iter(files.values()))
-    if any(name + COUNTS not in arrays for arrays in files.values()):
-        return first[name], None
-    pieces = {
-        rank: np.split(arrays[name], np.cumsum(arrays[name + COUNTS])[:-1])
-        for rank, arrays in files.items()
-    }
-    rows = [pieces[rank][place] for rank, place in places]
-    labels = [(s << SHIFT) + np.arange(len(part)) for s, part in zip(subdomains, rows, strict=True)]
-    none = np.zeros(0, dtype=np.int64)
-    return np.concatenate([first[name][:0], *rows]), np.concatenate([none, *labels])
 
 
 def damaged(file: Path, where: str) -> InputError:

@@ -247,7 +247,13 @@ class ContactDynamics(ContactProblem):
         lumped: bool = False,
         **others: Any,
     ) -> None:
-        check_guided(contacts)
+        for contact in checked_contacts(contacts):
+            shape = getattr(contact, "shape", None)
+            if isinstance(shape, RigidBody) and shape.free:
+                raise InputError(
+                    f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which "
+                    "knows no mass of it; expected displacement= or rotation= without free="
+                )
         self._stabilised, self._lumped = stabilised, lumped
         self._mass, self._velocity = mass, velocity
         self._with_thickness = others.get("thickness", 1.0)
@@ -484,14 +490,3 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         forces = self.report.contact_forces
         for i, blow in enumerate(self._blows):
             forces[i] = [a + float(b) for a, b in zip(forces[i], blow, strict=True)]
-
-
-def check_guided(contacts: Sequence[ContactPartner]) -> None:
-    """Raise if a rigid body has free motions, for which a step would need its mass."""
-    for contact in checked_contacts(contacts):
-        shape = getattr(contact, "shape", None)
-        if isinstance(shape, RigidBody) and shape.free:
-            raise InputError(
-                f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which knows "
-                "no mass of it; expected displacement= or rotation= without free="
-            )
