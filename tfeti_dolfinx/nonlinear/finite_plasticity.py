@@ -166,7 +166,7 @@ class _Return:
     ) -> None:
         self.F, self.mu, self.p, self.hardening = F, mu, p, hardening
         self.F_inverse = np.linalg.inv(F)
-        self.M = inverse_plastic @ _transposed(F)
+        self.M = inverse_plastic @ F.mT
         self.b, self.axes = np.linalg.eigh(F @ self.M)
         self.b = np.maximum(self.b, np.finfo(float).tiny)
         self.strain = 0.5 * np.log(self.b)
@@ -177,24 +177,24 @@ class _Return:
         self.share = 1.0 - 3.0 * mu * self.dp / q
         self.regular = hardening.regularisation * (self.dp > 0.0)
         self.n, self.q, self.s = 1.5 * s / q[:, None], q, s
-        tau = (self.axes * (self.share[:, None] * s)[:, None, :]) @ _transposed(self.axes)
-        self.P = tau @ _transposed(self.F_inverse)
+        tau = (self.axes * (self.share[:, None] * s)[:, None, :]) @ self.axes.mT
+        self.P = tau @ self.F_inverse.mT
 
     def tangent(self, entries: list[tuple[int, int]]) -> Array:
         """Return ∂P/∂F for some entries of both, shape (n, m, m)."""
         rows, columns = np.array(entries).T
         diagonal, shear = self._moduli()
-        P, turned = self.P, _transposed(self.axes)
+        P, turned = self.P, self.axes.mT
         found = np.empty((len(self.F), len(entries), len(entries)))
         for k, (i, j) in enumerate(entries):
             # δF = e_i e_jᵀ, so that δb has M's row j in its row i
             half = np.zeros_like(self.F)
             half[:, i, :] = self.M[:, j, :]
-            db = turned @ (half + _transposed(half)) @ self.axes
+            db = turned @ (half + half.mT) @ self.axes
             d_tau = shear * db
             strains = np.einsum("naa->na", db) / (2.0 * self.b)
             d_tau[:, range(3), range(3)] = np.einsum("nab,nb->na", diagonal, strains)
-            dP = self.axes @ d_tau @ turned @ _transposed(self.F_inverse)
+            dP = self.axes @ d_tau @ turned @ self.F_inverse.mT
             # δ(F⁻ᵀ) = −F⁻ᵀ δFᵀ F⁻ᵀ
             dP -= P[:, :, j, None] * self.F_inverse[:, None, :, i]
             found[:, :, k] = dP[:, rows, columns]
@@ -234,11 +234,7 @@ class _Return:
     def end(self) -> tuple[Array, Array]:
         """Return C_p⁻¹ and p at the end of the load step, as arrays of their functions."""
         elastic = np.exp(2.0 * (self.strain - self.dp[:, None] * self.n))
-        b = (self.axes * elastic[:, None, :]) @ _transposed(self.axes)
-        new = self.F_inverse @ b @ _transposed(self.F_inverse)
+        b = (self.axes * elastic[:, None, :]) @ self.axes.mT
+        new = self.F_inverse @ b @ self.F_inverse.mT
         rows, columns = np.array(SYMMETRIC).T
         return new[:, rows, columns].ravel(), self.p + self.dp
-
-
-def _transposed(t: Array) -> Array:
-    return np.swapaxes(t, 1, 2)
