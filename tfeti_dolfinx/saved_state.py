@@ -168,8 +168,8 @@ class SavedState:
     predicted: Array = field(default_factory=lambda: np.zeros(0))
     # that of the step which the matrix was made for, shape (); 0 without inertia
     size: Array = field(default_factory=lambda: np.zeros(()))
-    # what `Recycled` keeps of earlier solves, shape (2, m, k)
-    directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    # what `Recycled` keeps of earlier solves, shape (m, 2, k)
+    directions: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
     # internal variables of a nonlinear problem in each cell, (cells, w); else empty
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # motions of rigid bodies, one after the other
@@ -211,7 +211,6 @@ class SavedState:
     def from_table(cls, table: Table) -> SavedState:
         """Return what ``table`` has made a table of, of these or other subdomains."""
         values = {name: array for name, (array, _) in table.items()}
-        values["directions"] = values["directions"].swapaxes(0, 1)
         for name in ("u", "velocity", "load", "weights"):
             values[name] = values[name].reshape(-1)
         for name, kind in OF.items():
@@ -227,8 +226,6 @@ class SavedState:
             values = getattr(self, f.name)
             if f.name in KINDS:
                 continue
-            if f.name == "directions":
-                values = values.swapaxes(0, 1)
             if OF.get(f.name) == "nodes" and values.size:
                 values = rows_of(values, self.nodes)
             labels = getattr(self, OF[f.name]) if f.name in OF else None
@@ -276,8 +273,7 @@ class SavedState:
             if labels is None or OF[name] not in here:
                 continue
             values = arranged(values, labels, here[OF[name]])
-            values = values.reshape(-1) if OF[name] == "nodes" else values
-            changed[name] = values.swapaxes(0, 1) if name == "directions" else values
+            changed[name] = values.reshape(-1) if OF[name] == "nodes" else values
         return replace(self, **changed)
 
     def groups(self, dofs: TornDofs) -> list[Array]:
@@ -333,9 +329,8 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
         values, kind = getattr(state, f.name), OF.get(f.name)
         right = bool(np.all(np.isfinite(values)))
         if kind is not None:
-            length = values.shape[1] if f.name == "directions" else len(values)
             wanted = len(getattr(state, kind)) * (dofs.bs if kind == "nodes" else 1)
-            right &= length == wanted or (length == 0 and f.default_factory is not MISSING)
+            right &= len(values) in (wanted, 0 if f.default_factory is not MISSING else wanted)
         found[f.name] = right
     nodes = labels_of_nodes(dofs)
     found["secondary"] &= len(state.secondary) == contacts

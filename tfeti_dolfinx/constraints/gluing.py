@@ -330,17 +330,6 @@ class Gluing:
         self.constraints.c[:] = gluing.right_side()
         return gluing
 
-    def with_supports_at(self, values: Array) -> Array:
-        """Return this rank's part of c, but for supports, which hold the values, shape ``(g, bs)``.
-
-        Contacts meet prescribed components where the prescribed values have them.
-        """
-        c = np.array(self.constraints.c)
-        c[self.constraints.sets.equalities[self.held.row]] = (
-            values.ravel()[self.held.component] * self.held.factor
-        )
-        return c
-
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
 

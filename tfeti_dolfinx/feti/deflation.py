@@ -114,7 +114,11 @@ class SoftModes:
         prefix: str = "tfeti_coarse_",
     ) -> None:
         self._comm = coarse.comm
-        Gt, energy = _springs(B, coarse, *coarse.subdomains.soft_motions())
+        # this rank's rows of Ĝᵀ, with all motions outside of kernels as columns, and D
+        rows, own = coarse.subdomains.soft_motions()
+        energy, Gt = joined_over(self._comm, own), csr_array((B.getLocalSize()[0], 0))
+        if len(energy):
+            Gt = transposed_G(B, rows, len(energy))
         sigma = mean_stiffness(coarse.subdomains, weights)
         squares = np.bincount(Gt.indices, Gt.data**2, minlength=Gt.shape[1]).astype(float)
         squares = summed(self._comm, squares)
@@ -176,13 +180,3 @@ def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:
     terms = np.array([np.sum(subdomains.diagonal / weights), len(weights)])
     stiffness, unknowns = summed(subdomains.comm, terms)
     return float(stiffness / max(unknowns, 1.0))
-
-
-def _springs(
-    B: PETSc.Mat, coarse: CoarseSpace, rows: csr_array, own: Array
-) -> tuple[csr_array, Array]:
-    """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D. Collective."""
-    energy = joined_over(coarse.comm, own)
-    if not len(energy):
-        return csr_array((B.getLocalSize()[0], 0)), energy
-    return transposed_G(B, rows, len(energy)), energy

@@ -416,7 +416,7 @@ class NonlinearContactProblem(ContactProblem):
         Products with F are of the last tangent, which the run that goes on does not have.
         """
         weights = self._system.weights
-        state = replace(super().state(), image=np.zeros(0), directions=np.zeros((2, 0, 0)))
+        state = replace(super().state(), image=np.zeros(0), directions=np.zeros((0, 2, 0)))
         assert weights is not None
         state = replace(state, weights=weights)
         if not self._state.functions:

@@ -107,19 +107,19 @@ class Recycled(DirectionStore):
             self.add(x, Fx, energy)
 
     def in_order(self) -> Array:
-        """Return this rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
+        """Return this rank's part of W and FW, shape ``(m, 2, count)``, the oldest direction first.
 
         So they lie from then on: who takes them adds what it adds in the same order.
         """
         if self.count == self.capacity:
             self._hold(np.roll(self._rows, -self._next, axis=1), self.count)
-        return np.array(self._rows[:, : self.count].transpose(0, 2, 1))
+        return np.array(self._rows[:, : self.count].transpose(2, 0, 1))
 
     def take(self, kept: Array) -> None:
         """Restore another run's directions, the newest ones if they are too many."""
         newest = kept[:, :, max(kept.shape[2] - self.capacity, 0) :]
-        self._hold(np.zeros((2, 0, newest.shape[1])))
-        for w, Fw in zip(newest[0].T, newest[1].T, strict=True):
+        self._hold(np.zeros((2, 0, len(newest))))
+        for w, Fw in newest.transpose(2, 1, 0):
             self.put(w, Fw)
 
     def without(self, values: Array) -> Array:

@@ -217,7 +217,7 @@ class Checkpoint:
         if not any_rank(self._comm, not same):
             return state
         # F may be another there: it depends on K⁺, but for its values up to Gᵀ
-        none, directions = np.zeros(0), np.zeros((2, len(state.lam), 0))
+        none, directions = np.zeros(0), np.zeros((len(state.lam), 2, 0))
         return replace(state, mu=none, image=none, predicted_image=none, directions=directions)
 
     def read_fields(self, kept: Kept, number: int) -> Table:

@@ -133,7 +133,8 @@ class Predictor:
         before, primal = np.array(constraints.c), dofs.to_primal(w)
         total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add)
         held = total / dofs.multiplicity[:, None]
-        constraints.c[:] = gluing.with_supports_at(held)
+        rows = constraints.sets.equalities[gluing.held.row]
+        constraints.c[rows] = held.ravel()[gluing.held.component] * gluing.held.factor
         try:
             self._make(M, M @ w, gluing)
             return dofs.to_dolfinx(self._solve(gluing))
