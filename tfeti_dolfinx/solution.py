@@ -67,19 +67,6 @@ class PointValues:
     stress: Array
 
 
-def checked_points(points: Any, gdim: int) -> Array:
-    """Return finite points as an array of shape ``(k, gdim)``; raise an InputError for others."""
-    try:
-        found = np.array(points, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"points: {error}; expected numbers of shape (k, {gdim})") from error
-    if found.ndim != 2 or found.shape[1] != gdim or not np.all(np.isfinite(found)):
-        raise InputError(
-            f"points of shape {found.shape}; expected finite numbers of shape (k, {gdim})"
-        )
-    return found
-
-
 def value_row(u: Array, stress: Array) -> Array:
     """Return a row for each point: 1, displacement and stress."""
     return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
@@ -173,7 +160,18 @@ class Solution:
         """
         mesh, u = self.decomposition.mesh, self.displacement
         with agreeing(self.dofs.comm, "at") as given:
-            points = given["points"] = checked_points(points, mesh.geometry.dim)
+            gdim = mesh.geometry.dim
+            try:
+                points = np.array(points, dtype=float)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"points: {error}; expected numbers of shape (k, {gdim})"
+                ) from error
+            if points.ndim != 2 or points.shape[1] != gdim or not np.all(np.isfinite(points)):
+                raise InputError(
+                    f"points of shape {points.shape}; expected finite numbers of shape (k, {gdim})"
+                )
+            given["points"] = points
         (k, d), x = points.shape, np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
         # cells of this rank, each with a point by its position
         nodes = mesh.geometry.x

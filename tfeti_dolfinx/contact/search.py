@@ -130,7 +130,11 @@ class ContactSearch:
             moved = self._approach(contact, way.reshape(-1, self._dofs.bs))
             tried = [(self._records[i], self._reach[i])]
             if moved > self._reach[i]:
-                wide = self._far(i, moved)
+                # conditions up to twice the way, kept for the next ways while those near stay
+                known, wide, reach = self._wide.get(i, (None, self._records[i], 0.0))
+                if known is not self._records[i] or reach < moved:
+                    wide = self._search(i, 2.0 * moved)
+                    self._wide[i] = self._records[i], wide, 2.0 * moved
                 if self._count(self._overlapping(wide, u, tolerance) & ~wide.within_reach):
                     tried.insert(0, (self._search(i, moved), moved))
             for found, reach in tried:
@@ -148,14 +152,6 @@ class ContactSearch:
             there = replace(found, motion=self._tools.motion(found, found=True))
         v = relative_displacement(there, self._dofs, u)
         return np.asarray(found.gap - np.sum(found.normal * v, axis=1) < -tolerance)
-
-    def _far(self, i: int, moved: float) -> ContactRecords:
-        """Conditions up to twice a way at least, kept for the next ways while those near stay."""
-        known, found, reach = self._wide.get(i, (None, self._records[i], 0.0))
-        if known is not self._records[i] or reach < moved:
-            found, reach = self._search(i, 2.0 * moved), 2.0 * moved
-            self._wide[i] = self._records[i], found, reach
-        return found
 
     def widen(self) -> int:
         """Increase the reach until a condition gets a row, since far contact may hold a body.

@@ -182,19 +182,14 @@ def read_surface(path: str | os.PathLike[str], comm: MPI.Intracomm) -> SurfaceMe
     found: tuple[Array, Array] | None = None
     with raised_on_all_ranks(comm), named(f"cannot read {path}"):
         if comm.rank == 0:
-            found = _triangles(Path(path))
+            with open_model(Path(path)) as model:
+                tags, x, _ = model.mesh.getNodes()
+                _, corners = model.mesh.getElementsByType(2)
+            if not len(corners):
+                raise InputError(f"{path} has no triangles")
+            place = np.zeros(int(tags.max()) + 1, dtype=np.int64)
+            place[tags.astype(np.int64)] = np.arange(len(tags))
+            found = x.reshape(-1, 3), place[corners.astype(np.int64)].reshape(-1, 3)
     points, facets = comm.bcast(found, root=0)
     with raised_on_all_ranks(comm), named(str(path)):
         return SurfaceMesh(points, facets)
-
-
-def _triangles(path: Path) -> tuple[Array, Array]:
-    """Return points and triangles that gmsh finds in a file."""
-    with open_model(path) as model:
-        tags, x, _ = model.mesh.getNodes()
-        _, corners = model.mesh.getElementsByType(2)
-    if not len(corners):
-        raise InputError(f"{path} has no triangles")
-    place = np.zeros(int(tags.max()) + 1, dtype=np.int64)
-    place[tags.astype(np.int64)] = np.arange(len(tags))
-    return x.reshape(-1, 3), place[corners.astype(np.int64)].reshape(-1, 3)

@@ -10,7 +10,6 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
-from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
 from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
@@ -129,7 +128,16 @@ def measure(
         subdomains.extended(subdomains.pinv_load[subdomains.trace]),
     )
     size, elastic, correction, change, alone = subdomains.body_sizes(displacements)
-    balance, forces = _balance(dual.coarse, state.lam)
+    # the entry of Gλ − e that is largest beside the forces on its mode; rounding of the largest
+    # forces is nobody's to mend
+    balance = forces = 0.0
+    if (coarse := dual.coarse).dimension:
+        on_modes = coarse.terms(state.lam)
+        most = on_modes.max()
+        on_modes = np.maximum(on_modes, LIGHT * most)
+        apart = np.abs(coarse.G(state.lam) - coarse.e) - StoppingTolerances.noise * most
+        worst = int(np.argmax(np.maximum(apart, 0.0) / np.maximum(on_modes, TINY)))
+        balance, forces = float(max(apart[worst], 0.0)), float(on_modes[worst])
     return Measures(
         size=size,
         elastic=elastic,
@@ -151,19 +159,6 @@ def measure(
         longest=max(float(correction.max(initial=0.0)), float(largest[0])),
         effect=norm * float(multipliers),
     )
-
-
-def _balance(coarse: CoarseSpace, lam: Array) -> tuple[float, float]:
-    """Entry of Gλ − e that is largest beside the forces on its mode, and those. Collective."""
-    if coarse.dimension == 0:
-        return 0.0, 0.0
-    forces = coarse.terms(lam)
-    most = forces.max()
-    forces = np.maximum(forces, LIGHT * most)
-    # rounding of the largest forces is nobody's to mend
-    left = np.maximum(np.abs(coarse.G(lam) - coarse.e) - StoppingTolerances.noise * most, 0.0)
-    worst = int(np.argmax(left / np.maximum(forces, TINY)))
-    return float(left[worst]), float(forces[worst])
 
 
 # --- The stopping rule ------------------------------------------------------------------------

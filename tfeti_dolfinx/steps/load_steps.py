@@ -438,7 +438,15 @@ class LoadSteps:
         records = [StepRecord(**record) for record in kept.records]
         ends = {record.number: record.time for record in records}
         reached = [about["begin"], *(ends[number] for number in range(place.number))]
-        self._check_times(reached + ([about["towards"]] if place.done else []))
+        reached += [about["towards"]] if place.done else []
+        # but for rounding, as of a longer ``linspace``
+        given, rounding = self._times[: len(reached)], 1e-6 * min(np.diff(reached), default=0.0)
+        for now, before in zip_longest(given, reached):
+            if now is None or abs(now - before) > rounding:
+                raise InputError(
+                    f"the checkpoint is of a series with the times {shown(reached)}, begin "
+                    f"first; expected those, got {shown(given)}, {now} instead of {before}"
+                )
         self._problem.take_step(records[-1].size)
         self._set(records[-1].time)
         digest = self._problem.digest()
@@ -458,17 +466,6 @@ class LoadSteps:
                 self._series = None
                 raise
         return place
-
-    def _check_times(self, reached: list[float], same: float = 1e-6) -> None:
-        """Raise unless times are those reached, but for rounding, as of a longer ``linspace``."""
-        given = self._times[: len(reached)]
-        rounding = same * min(np.diff(reached), default=0.0)
-        for now, before in zip_longest(given, reached):
-            if now is None or abs(now - before) > rounding:
-                raise InputError(
-                    f"the checkpoint is of a series with the times {shown(reached)}, begin "
-                    f"first; expected those, got {shown(given)}, {now} instead of {before}"
-                )
 
     def _close(self) -> None:
         series, self._series = self._series, None
