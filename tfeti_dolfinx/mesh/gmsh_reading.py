@@ -238,20 +238,11 @@ def _facet_tags(
 
     Both meet on the rank that their key names, without a communicator here. Collective.
     """
-    corners = facet_vertices(cell_type)
-    tagged = np.concatenate(
-        [
-            np.empty((0, corners.shape[1]), np.int64),
-            *(e.nodes[:, : corners.shape[1]] for e in facets),
-        ]
-    )
+    width = facet_vertices(cell_type).shape[1]
+    none = np.empty(0, dtype=np.uint64)
+    known = np.concatenate([none, *(set_key(e.nodes[:, :width]) for e in facets)])
     tags = np.concatenate([np.empty(0, dtype=np.int32), *(elements.tags for elements in facets)])
-    near = np.arange(len(cells))
-    if comm is None:  # few cells have a facet whose vertices all have a facet that is tagged
-        some = np.isin(node_ids, tagged)[cells[:, : corners.max() + 1]]
-        near = near[np.sum(some, axis=1) >= corners.shape[1]]
-    meeting, known = comm or MPI.COMM_SELF, set_key(tagged)
-    keys = facet_keys(cells[near], node_ids, cell_type)
+    keys, meeting = facet_keys(cells, node_ids, cell_type), comm or MPI.COMM_SELF
     asking, telling = exchange_by_key(meeting, keys.ravel()), exchange_by_key(meeting, known)
     asked, known, tags = asking.send(keys.ravel()), telling.send(known), telling.send(tags)
     hits: Array = np.full(len(asked), NO_TAG, dtype=np.int32)
@@ -259,9 +250,7 @@ def _facet_tags(
         known, first = np.unique(known, return_index=True)
         position = np.minimum(np.searchsorted(known, asked), len(known) - 1)
         hits = np.where(known[position] == asked, tags[first[position]], hits)
-    found = np.full((len(cells), len(corners)), NO_TAG, dtype=np.int32)
-    found[near] = asking.answer(hits).reshape(keys.shape)
-    return found
+    return asking.answer(hits).reshape(keys.shape)
 
 
 # --- Meshes of gmsh: physical groups, partitions, node numbers --------------------------------
