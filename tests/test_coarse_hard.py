@@ -11,7 +11,8 @@ from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.feti.projectors import NullModes, SemidefiniteFactor
+from tfeti_dolfinx.feti.projectors import Grams, NullModes, SemidefiniteFactor
+from tfeti_dolfinx.qp.sets import Face, Status
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
@@ -68,3 +69,12 @@ def test_an_indefinite_matrix_is_named_on_all_ranks():
     A = csr_array(LAPLACIAN - 0.1 * np.eye(4))
     with pytest.raises(FactorError, match="A of the test: not positive definite"):
         SemidefiniteFactor(A, NO_NULL, MPI.COMM_WORLD, "A of the test")
+
+
+def test_what_cancels_along_a_tangent_leaves_no_rounding(comm):
+    """GZ(GZ)ᵀ of two rows a rank that differ by 1e-5, along (1, −1)/√2: what is left, squared."""
+    Gt, way = np.array([[1 / 3, 0.7], [1 / 3 + 1e-5, 0.2]]), np.array([[1.0, -1.0]]) / np.sqrt(2.0)
+    slips = Face(np.zeros(2, bool), np.full(2, Status.SLIP), np.array([[0, 1]]), way, np.zeros(1))
+    gram = Grams(csr_array(Gt), np.arange(2), comm).of_face(slips).toarray()
+    expected = comm.size * (way @ Gt).T @ (way @ Gt)
+    assert np.all(np.abs(gram - expected) <= 1e-10 * np.abs(expected))

@@ -79,9 +79,10 @@ class Grams:
         if tangents:
             count, width = face.tangents.shape
             each = rows_of(self.Gt, face.tangent_rows.ravel(), face.tangents.ravel())
-            # the rows of a tangent as one, in which a column may stand more than once
-            along = each._replace(indptr=each.indptr[::width], shape=(count, size))
-            gram = gram + replicated(transposed(along).csr() @ along.csr(), self.comm)
+            # the rows of a tangent as one: of what cancels in it squares keep no rounding
+            along = each._replace(indptr=each.indptr[::width], shape=(count, size)).csr()
+            along.sum_duplicates()
+            gram = gram + replicated((along.T @ along).tocsr(), self.comm)
         return gram
 
 
