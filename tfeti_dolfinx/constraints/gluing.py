@@ -309,7 +309,7 @@ class Gluing:
 
     def _rounding(self) -> Array:
         """Slack of gaps, since facets of curved surfaces may overlap where bodies do not."""
-        curved = np.abs(self.records.curved_gap - self.records.geometric_gap)
+        curved = 2.0 * np.abs(self.records.curved_gap - self.records.geometric_gap)
         return np.asarray(curved + TOLERANCES.overlap * self.length)
 
     def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:

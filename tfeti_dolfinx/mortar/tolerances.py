@@ -40,7 +40,7 @@ class SearchTolerances:
     # have gaps that are positive (from 0.41 of a facet on where it is quadratic)
     mostly: float = 0.5
     # of a facet's radius: sides that are farther apart at a vertex that is held do not close there
-    together: float = 0.05
+    together: float = 0.2
     same_layer: float = 1e-9  # distances closer than this are those of facets of one layer
     covered_twice: float = 1e-6  # common parts that exceed a facet by less are one layer
     # cosine, of about 92°: facets seen from the side have only slivers in common
