@@ -13,7 +13,7 @@ from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Untorn
 from benchmarks.stress.scene import Body, Load, Scene
 
-SEEDS = [*range(1, 6), 131]
+SEEDS = [*range(1, 6), 131, 820070]  # that rests on an edge which is held on one side
 SEEDS += [pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40)]
 
 NONLINEAR = [1, 5, 8, 11]

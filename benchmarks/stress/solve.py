@@ -13,6 +13,7 @@ from scipy.sparse.linalg import splu
 
 DEPENDENT = 1e-10
 ESCAPES, SURELY_HELD = 1e-6, 1e-9  # work of a motion, of that of all loads
+FARTHER = 10.0
 PENALTY = 1e4  # of a row's stiffness
 ROUNDING = 1e-9
 WRONG = 1e-7  # relative residual of the reference
@@ -88,7 +89,8 @@ def guess(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows that carry force, and the rigid part of u, by the dual problem.
 
-    min ½λᵀFλ − dᵀλ, Gλ = e, λ ≥ 0, with the compliance F = N K⁺ Nᵀ; s = Fλ − d − Gᵀα.
+    min ½λᵀFλ − dᵀλ, Gλ = e, λ ≥ 0, with the compliance F = N K⁺ Nᵀ; s = Fλ − d − Gᵀα. Rows whose
+    gaps are far come in when they are overlapped: they would spoil its scale.
     """
     Q = np.linalg.qr(R)[0] if R.shape[1] else R
     inverse = pinned_inverse(K, R)
@@ -101,9 +103,22 @@ def guess(
 
     if N.shape[0] == 0:
         return np.zeros(0, dtype=bool), np.zeros(len(f))
-    F, d = N @ compliance(np.asarray(N.T.todense())), N @ compliance(f) - gap
-    active, alpha = interior_point(0.5 * (F + F.T), d, np.asarray((N @ R).T), e)
-    return active, R @ alpha
+    F = N @ compliance(np.asarray(N.T.todense()))
+    F, d, G = 0.5 * (F + F.T), N @ compliance(f) - gap, np.asarray((N @ R).T)
+    for share in (0.25, 0.5, 0.75, 1.0):
+        reach = np.quantile(np.abs(gap), share)
+        near = np.abs(gap) <= (FARTHER * reach if share < 1.0 else np.inf)
+        for _ in range(20):
+            found = interior_point(F[np.ix_(near, near)], d[near], G[:, near], e)
+            if found is None:
+                break
+            lam, active = np.zeros(len(gap)), np.zeros(len(gap), dtype=bool)
+            lam[near], active[near], alpha = found
+            entered = ~near & (F @ lam - d - G.T @ alpha < 0.0)
+            if not entered.any():
+                return active, R @ alpha
+            near = near | entered
+    raise UnsettledError("Gλ = e has no solution, or far rows came in again and again")
 
 
 def pinned_inverse(K: csr_array, R: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -214,8 +229,8 @@ def close(
 
 def interior_point(
     F: np.ndarray, d: np.ndarray, G: np.ndarray, e: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where λ > s, and α at the end of Mehrotra's predictor and corrector.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """λ, where λ > s, and α at the end of Mehrotra's predictor and corrector; None without a λ.
 
     SIAM J. Optim. 2, 1992.
     """
@@ -226,7 +241,7 @@ def interior_point(
     felt = sigma > UNFELT * sigma.max(initial=0.0)
     U, sigma, G = U[:, felt], sigma[felt], Vt[felt]
     if np.linalg.norm(e - U @ (U.T @ e)) > 1e-8 * np.linalg.norm(e):
-        raise UnsettledError("Gλ = e has no solution")
+        return None
     e = U.T @ e / sigma
     m, r = len(d), len(e)
     size = max(np.abs(d).max(initial=0.0), np.abs(e).max(initial=0.0), 1e-300)
@@ -247,7 +262,7 @@ def interior_point(
         if not np.isfinite(length) or length < 1e-12:
             break
         lam, alpha, s = lam + length * dl, alpha + length * da, s + length * ds
-    return lam > s, U @ (alpha * size / sigma)
+    return lam * size / scale, lam > s, U @ (alpha * size / sigma)
 
 
 def _newton_step(

@@ -167,15 +167,15 @@ class DualMultipliers:
     ) -> tuple[DualMultipliers, Array]:
         """Multipliers of which those at vertices that are held have passed on to neighbours.
 
-        On each facet vertices pass on to those of the lowest level, ``(f, v)``, where all are held
-        on both sides to the first. Where there is a spot, ``vertex`` of the facet ``facet[spot]``,
-        ψ_d becomes D_d times a Dirac there, and the neighbours get the rest; else they get all of
-        it. The sum of all stays, and so do integrals of what is linear. Return also which spots are
-        points now, the last ones.
+        On each facet vertices that are held on both sides, to which ``level`` of shape ``(f, v)``
+        adds up, pass on to those that are not, where all are to the first. Where there is a spot,
+        ``vertex`` of the facet ``facet[spot]``, ψ_d becomes D_d times a Dirac there, and the
+        neighbours get the rest; else they get all of it. The sum of all stays, and so do integrals
+        of what is linear. Return also which spots are points now, the last ones.
         """
         v, level = level.shape[1], np.array(level, dtype=float)
         level[level.min(axis=1) > 2.0 - SEARCH.mostly, 0] -= 1.0
-        held = level > np.maximum(level.min(axis=1) + SEARCH.held, SEARCH.mostly)[:, None]
+        held = level > np.maximum(level.min(axis=1) + SEARCH.held, 1.0 + SEARCH.mostly)[:, None]
         to = np.repeat(~held[:, :, None], v, axis=2)
         beside = to & kind.hats.neighbours
         to = np.where(beside.any(axis=1, keepdims=True), beside, to) & held[:, None]
@@ -236,7 +236,7 @@ def integrate(
     """
     at = segments.points
     dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
-    if np.any(primary.held) or (kind.displacement.degree > 1 and np.any(secondary.held)):
+    if np.any(primary.held) and np.any(secondary.held):
         corners = segments.corners
         level, corner, *spots = _held(kind, (secondary, primary), corners, dual.facet, closed)
         dual, used = dual.passed_on(kind, level, *spots)
@@ -293,11 +293,11 @@ def _shares(facets: Facets, dual: DualMultipliers) -> Triplets:
 def _held(
     kind: FacetKind, sides: tuple[Facets, Facets], at: FacingPoints, facet: Array, closed: bool
 ) -> tuple[Array, Array, Array, Array]:
-    """On how many sides facets are held at their vertices, of those that may bend over them.
+    """On how many sides facets are held at their vertices.
 
-    The secondary side may where its trace has a degree above 1. Both are looked at where a corner
-    of common parts is next to the vertex, the primary one by the share of its hats that is held;
-    what is far apart there counts as free, unless gaps are given. Return also the corners that are
+    Both are looked at where a corner of common parts is next to the vertex, the primary one by the
+    share of its hats that is held; what is far apart there counts as free, unless gaps are given.
+    What one side alone holds bears the other one, and stays. Return also the corners that are
     at a vertex, the place of their facet, and the vertex; not where the primary side is nearly
     held, since what moves there would do so in a row of its own.
     """
@@ -308,7 +308,7 @@ def _held(
     np.maximum.at(nearest, place, hats)
     near = hats > nearest[place] - SEARCH.held
     free = np.sum(np.abs(kind.hats.values(at.eta)) * ~primary.held[at.primary], axis=1)
-    own = secondary.held[at.secondary] * (kind.displacement.degree > 1)
+    own = secondary.held[at.secondary]
     apart = np.linalg.norm(_apart(kind, secondary, primary, at, False), axis=1)
     close = closed | (apart <= SEARCH.together * secondary.radius[at.secondary])
     level = np.full(nearest.shape, 2.0)
