@@ -236,7 +236,7 @@ def integrate(
     """
     at = segments.points
     dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
-    if np.any(primary.held) and np.any(secondary.held):
+    if np.any(secondary.held) and (np.any(primary.held) or kind.displacement.degree > 1):
         corners = segments.corners
         level, corner, *spots = _held(kind, (secondary, primary), corners, dual.facet, closed)
         dual, used = dual.passed_on(kind, level, *spots)
@@ -297,9 +297,10 @@ def _held(
 
     Both are looked at where a corner of common parts is next to the vertex, the primary one by the
     share of its hats that is held; what is far apart there counts as free, unless gaps are given.
-    What one side alone holds bears the other one, and stays. Return also the corners that are
-    at a vertex, the place of their facet, and the vertex; not where the primary side is nearly
-    held, since what moves there would do so in a row of its own.
+    What one side alone holds bears the other one, and stays, but where a secondary trace of a
+    degree above 1 bends beside a vertex that is held: it counts as held on both, to be a point.
+    Return also the corners that are at a vertex, the place of their facet, and the vertex; not
+    where the primary side is nearly held, since what moves there would do so in a row of its own.
     """
     secondary, primary = sides
     place = np.searchsorted(facet, at.secondary)
@@ -316,6 +317,11 @@ def _held(
     np.minimum.at(level, place, np.where(near, held, 2.0))
     nearly = (free > SEARCH.held) & (free <= SEARCH.mostly)
     corner, vertex = np.nonzero(near & (hats > 1.0 - SEARCH.held) & ~nearly[:, None])
+    if kind.displacement.degree > 1:
+        bends = np.zeros(level.shape, dtype=bool)
+        bends[place[corner], vertex] = close[corner]
+        held_here = secondary.held[facet]
+        level[bends & held_here & ~held_here.all(axis=1, keepdims=True)] = 2.0
     return level, corner, place[corner], vertex
 
 
