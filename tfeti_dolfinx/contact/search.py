@@ -81,9 +81,14 @@ class ContactSearch:
         return np.concatenate([none, *found])
 
     def sees(self, changed: Array) -> bool:
-        """Return whether flags of owned groups' components have one on a contact surface."""
+        """Return whether flags of owned groups' components have one where it makes other rows.
+
+        On surfaces of a pair, and of degree above 1 on that of an obstacle.
+        """
         dofs = self._dofs
-        names = [name for contact in self.contacts for name in contact.surfaces]
+        bends = dofs.V.element.basix_element.degree > 1
+        found = [contact for contact in self.contacts if bends or len(contact.surfaces) > 1]
+        names = [name for contact in found for name in contact.surfaces]
         nodes = [facet_nodes(dofs, dofs.decomposition.facets(name)).ravel() for name in names]
         groups = dofs.group[np.concatenate([np.empty(0, dtype=np.int64), *nodes])]
         return any_rank(dofs.comm, dofs.lookup(groups, changed)[0])
