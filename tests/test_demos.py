@@ -17,8 +17,9 @@ def test_quick_size(name, quick_demo, comm):
     assert any(found.folder.glob(f"{name}*.bp")) or any(found.folder.glob(f"{name}*.xdmf"))
     assert any(found.folder.glob(f"{name}*.png")) == found.drawn
     assert ("TFETI solve CONVERGED" in found.out) == (comm.rank == 0)
-    # a terminal shows what is logged, too
-    assert all(found.out.count(text) <= 1 for text in found.report["warnings"])
+    # a terminal shows what is logged, too; two levels of refinement may have the same to say
+    most = found.out.count("TFETI solve") if name.startswith("adaptive") else 1
+    assert all(found.out.count(text) <= most for text in found.report["warnings"])
 
 
 @pytest.mark.parametrize("name", DEMOS)
