@@ -34,7 +34,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.recovery import nearest
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import check_mesh, check_ring, check_same_space, displacement_space
-from tfeti_dolfinx.forms.fields import Stress, checked_stress, checked_thickness, frozen
+from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
@@ -135,7 +135,7 @@ class ContactProblem:
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
         self._first = np.array(self.u.x.array)
         self._given_stress = stress
-        self._stress: Any = None
+        self._stress: Freezable | None = None
         if stress is not None:
             with agreeing(comm, "stress(u)") as given:
                 given["stress(u)"] = sigma = self._look_at_stress()
@@ -349,7 +349,7 @@ class ContactProblem:
             multipliers=multipliers,
             gluing=gluing,
             contacts=list(self._system.search.contacts),
-            stress=None if self._stress is None else frozen(self._stress, self.u),
+            stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
         )
         solution.boundary = self._system.elements.solved(u)
@@ -585,9 +585,12 @@ class ContactProblem:
 
     def _look_at_stress(self) -> Any:
         """Return the user's stress of ``u`` in UFL, which solutions take until the next look."""
-        if self._given_stress is not None:
-            self._stress = checked_stress(self._given_stress, self.u)
-        return self._stress
+        if self._given_stress is None:
+            return None
+        sigma = checked_stress(self._given_stress, self.u)
+        if self._stress is None or self._stress.expression is not sigma:
+            self._stress = Freezable(sigma, self.u)
+        return sigma
 
     def _checked_u(self, u: fem.Function, V: fem.FunctionSpace, name: str = "u") -> fem.Function:
         checked_type(u, fem.Function, name, "a dolfinx.fem.Function on the space of a")

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import ufl
 from dolfinx import fem, geometry
 from mpi4py import MPI
 
@@ -110,9 +109,7 @@ class Solution:
         self.u, self.lam = u, multipliers.lam
         self.carrying, self.holding = multipliers.face.carrying, multipliers.face.holding
         self.gluing, self.dofs, self.decomposition = gluing, gluing.dofs, gluing.dofs.decomposition
-        is_number = not isinstance(thickness, ufl.core.expr.Expr)
-        self.contacts = list(contacts)
-        self.thickness: Any = thickness if is_number else frozen(thickness)()
+        self.contacts, self.thickness = list(contacts), frozen(thickness)
         self.tool_motions: Sequence[ToolMotion] = ()
         self.finite = False
         self.v: Array | None = None
