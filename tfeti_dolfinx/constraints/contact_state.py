@@ -8,9 +8,7 @@ from enum import IntEnum
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.contact.records import (
-    Resultant,
-)
+from tfeti_dolfinx.contact.records import Resultant
 from tfeti_dolfinx.qp.sets import Face
 
 
