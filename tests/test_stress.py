@@ -14,9 +14,9 @@ from benchmarks.stress.reference import Untorn
 from benchmarks.stress.scene import Body, Load, Scene
 
 SEEDS = [*range(1, 6), 131, 820070]  # that rests on an edge which is held on one side
+SEEDS += [900406, 900508]  # of which nothing holds a body
 SEEDS += [pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40)]
-
-NONLINEAR = [1, 5, 8, 11]
+SHEETS = (30, 39)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -25,9 +25,10 @@ def test_random_scenes_are_right_or_named(seed, comm):
     row = judge.run_scene(random_scene(seed), comm)
     if comm.rank == 0:
         assert row["class"].islower(), row
+        assert row["class"] != "not converged" or seed in SHEETS, row
 
 
-@pytest.mark.parametrize("seed", NONLINEAR)
+@pytest.mark.parametrize("seed", [1, 5, 8, 11])
 def test_random_nonlinear_scenes_are_right(seed, serial_only):
     row = nonlinear.run_scene(nonlinear.random_scene(seed))
     assert row["class"] == "right", row

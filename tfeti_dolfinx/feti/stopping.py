@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
-from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
+from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, nearest, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, QPResult, StoppingRule
 from tfeti_dolfinx.qp.sets import Face
@@ -308,10 +308,19 @@ class Accuracy(StoppingRule):
         return bool(ratio <= 1.0 or longest <= self._atol)
 
     def examine_stopped(self, result: QPResult) -> None:
-        """Assess where a solver has stopped early: errors that rounding explains are accepted."""
-        self._small = float("inf")
+        """Assess where a solver has stopped early: errors that rounding explains are accepted.
+
+        Motions that no active row holds are as right elsewhere: they are no change of u.
+        """
+        self._small, before = float("inf"), self.recovered
         residual = max(result.projected_gradient, result.norm * result.equality)
-        reason = self.examine(result.lam, result.gradient, result.face, residual)
+        given = result.lam, result.gradient, result.face, residual
+        reason = self.examine(*given)
+        now, older = self.recovered, self._before
+        if reason <= 0 and before is not None and now is not None and older is not None:
+            held = nearest(self._dual.coarse, now, before.u) - before.u
+            self.recovered, self.measures = replace(now, u=now.u - held), older
+            reason = self.examine(*given)
         if reason > 0:
             result.reason = reason
 
