@@ -246,3 +246,4 @@ class GroupedOperator:
         """out = diag(A_s) w, shapes ``(t,)``."""
         for group in self._groups:
             group.mult(w, out)
+        self._groups.reverse()  # what a product has read last the next one finds in the cache
