@@ -16,6 +16,7 @@ from tfeti_dolfinx.contact.rigid_body import Pose, motion_fields
 
 CELLS = {2: "triangle", 3: "tetrahedron"}
 TIGHT = {"rtol": 1e-10}
+ROUGH = tfeti.Coulomb(0.3)
 DOWN = {2: np.array((0.0, -1.0)), 3: np.array((0.0, 0.0, -1.0))}
 
 
@@ -82,7 +83,7 @@ def test_another_displacement_needs_neither_rows_nor_factors():
 
 
 @pytest.mark.parametrize("gdim", [2, 3])
-@pytest.mark.parametrize("friction", [None, tfeti.Coulomb(0.3)])
+@pytest.mark.parametrize("friction", [None, ROUGH])
 def test_a_force_moves_a_tool_as_far_as_its_displacement_has_needed(gdim, friction):
     scene, way = block(gdim), 0.03 * DOWN[gdim]
     law = tfeti.RigidBody(ball(gdim), displacement=way, name="ball")
@@ -168,9 +169,8 @@ def test_one_tool_on_two_surfaces_has_the_statics_of_a_beam():
     ],
 )
 def test_a_tool_that_nothing_balances_is_named(tool, words):
-    with pytest.raises(tfeti.NoSolutionError, match="punch") as caught:
+    with pytest.raises(tfeti.NoSolutionError, match=f"punch.*{words}"):
         solved(block(2, n=3), tfeti.Obstacle("top", tfeti.RigidBody(top(2), name="punch", **tool)))
-    assert words in str(caught.value)
 
 
 def test_motions_that_nothing_resists_or_drives_are_free():
@@ -491,55 +491,56 @@ def test_a_free_body_that_friction_has_held_is_let_go():
             assert t != 2 or largest([*u.x.array, problem.report.F_multiplications / 1e4]) < 0.05
 
 
-def ball_mesh(m):
-    """Triangles of a ball of radius 1 about the origin."""
-    panels = SPACE["ball"](m)
-    return panels.x, panels.nodes
+SIDES = {2: polygon([(0, 0), (1, 0), (1, 1), (0, 1)], 1), 3: SPACE["cube"](1)}  # of unit bodies
 
 
 def test_distance_from_a_mesh_is_that_of_its_body():
     """Of a square and a cube exactly, next to sides, edges and corners too; of a ball with h²."""
     rng, step = np.random.default_rng(0), 1e-6
-    for panels in (polygon([(0, 0), (1, 0), (1, 1), (0, 1)], 1), SPACE["cube"](1)):
-        mesh, gdim = tfeti.SurfaceMesh(panels.x, panels.nodes), panels.dim
+    for gdim, panels in SIDES.items():
+        mesh = tfeti.SurfaceMesh(panels.x, panels.nodes)
         p = rng.uniform(-0.6, 1.6, (3, 400))
         x = p[:gdim]
         out = np.maximum(np.maximum(-x, x - 1.0), 0.0)
         inside = np.min(np.minimum(x, 1.0 - x), axis=0)
         expected = np.where(inside > 0.0, -inside, np.linalg.norm(out, axis=0))
         assert np.allclose(mesh.distance(p), expected, atol=1e-12)
-        slope = [
-            (mesh.distance(p + d) - mesh.distance(p - d)) / (2 * step)
-            for d in step * np.eye(3)[:, :, None]
-        ]
+        ways = step * np.eye(3)[:, :, None]
+        slope = [(mesh.distance(p + d) - mesh.distance(p - d)) / (2 * step) for d in ways]
         assert np.median(np.abs(mesh.gradient(p) - slope)) <= 1e-8
         assert mesh.gradient(p[:, :0]).shape == (3, 0)
-    ball = tfeti.SurfaceMesh(*ball_mesh(12))
+    ball = tfeti.SurfaceMesh((panels := SPACE["ball"](12)).x, panels.nodes)
     p = rng.standard_normal((3, 200))
     assert np.abs(ball.distance(p) - np.linalg.norm(p, axis=0) + 1.0).max() <= 0.02
 
 
-def test_a_mesh_presses_as_its_shape_does(tmp_path):
+def test_a_mesh_presses_as_its_shape_does(tmp_path, comm):
     """A tool from an STL file, beside the sphere that it stands for."""
     scene = block(3, n=4)
-    comm = scene["decomposition"].comm
-    points, facets = ball_mesh(24)
-    points = points + (0.5, 0.5, 2.0)
-    path = comm.bcast(str(tmp_path / "ball.stl"))
+    panels, path, forces = SPACE["ball"](24), comm.bcast(tmp_path / "ball.stl"), []
     if comm.rank == 0:
-        with open(path, "w") as file:
-            file.write("solid ball\n")
-            for triangle in points[facets]:
-                file.write("facet normal 0 0 0\nouter loop\n")
-                file.writelines("vertex {:.12g} {:.12g} {:.12g}\n".format(*v) for v in triangle)
-                file.write("endloop\nendfacet\n")
-            file.write("endsolid ball\n")
+        vertices = 3 * "vertex {:.12g} {:.12g} {:.12g}\n"
+        facet = f"facet normal 0 0 0\nouter loop\n{vertices}endloop\nendfacet\n"
+        triangles = (panels.x + (0.5, 0.5, 2.0))[panels.nodes].reshape(-1, 9)
+        facets = "".join(facet.format(*triangle) for triangle in triangles)
+        path.write_text(f"solid ball\n{facets}endsolid ball\n")
     comm.Barrier()
-    forces = []
-    for shape in (tfeti.read_surface(path, comm), ball(3)):
+    for shape in (tfeti.read_surface(str(path), comm), ball(3)):
         tool = tfeti.RigidBody(shape, displacement=(0, 0, -0.05))
         forces.append(solved(scene, tfeti.Obstacle("top", tool)).solution.tool(0).resultant.force)
     assert np.isclose(forces[0][2], forces[1][2], rtol=0.03)
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+def test_a_tool_whose_edges_lie_on_nodes_presses_along_the_normal_of_the_body(gdim):
+    """As one does that is a little wider: at an edge the normal is that of the side that meets."""
+    x, scene, found = SIDES[gdim].x, block(gdim), []
+    for width in (1.0 / 3.0, 0.35):
+        corners = width * (x - 0.5) + 0.5 - (0.5 + width / 2.0) * DOWN[gdim]
+        shape = tfeti.SurfaceMesh(corners, SIDES[gdim].nodes)
+        tool = tfeti.Obstacle("top", shape, displacement=0.02 * DOWN[gdim], friction=ROUGH)
+        found.append(solved(scene, tool))
+    assert same(*found)
 
 
 def test_meshes_that_do_not_fit_are_named(comm):
@@ -556,12 +557,11 @@ def test_meshes_that_do_not_fit_are_named(comm):
 
 
 def test_a_tool_whose_bounds_of_friction_do_not_come_to_rest_is_named():
-    rough, scene = tfeti.Coulomb(0.3), block(2)
+    scene = block(2)
     heavy = tfeti.RigidBody(ball(2), displacement=0.03 * DOWN[2], name="heavy")
     beside = tfeti.Sphere((2.0, 0.5), 1.0)
     light = tfeti.RigidBody(beside, force=(-1e-3, 0.0), free=("x",), name="light")
-    contacts = [tfeti.Obstacle("top", heavy, friction=rough)]
-    contacts.append(tfeti.Obstacle("right", light, friction=rough))
+    contacts = [tfeti.Obstacle(*on, friction=ROUGH) for on in (("top", heavy), ("right", light))]
     with pytest.raises(tfeti.ConvergenceError, match="least of all on the body 'light'"):
         solved(scene, *contacts, friction_type="fixed_point", friction_max_it=1)
     solved(scene, *contacts)

@@ -24,6 +24,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
+    Facets,
     diameter,
     extent,
     facet_kind,
@@ -276,9 +277,13 @@ class Obstacle(ContactPartner):
             )
         with raised_on_all_ranks(dofs.comm):
             distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)
+            beside, at_edge = self._beside_edges(facets, distance, towards)
         vertices = facets.vertices.ravel()
         normals = dofs.reduce_on_owners(vertices, towards, np.maximum, -np.inf)
         normals[~np.isfinite(normals)] = 0.0  # off the surface
+        sides = dofs.reduce_on_owners(vertices[at_edge], beside)
+        length = np.linalg.norm(sides, axis=1, keepdims=True)
+        normals = np.where(length > 0.0, sides / np.where(length > 0.0, length, 1.0), normals)
         if not (isinstance(self.shape, RigidBody) and self.shape.free):
             facets = with_held_vertices(facets, dofs, normals, flag)
         side = Side(facets, hat_areas(kind, facets), normals)
@@ -288,6 +293,22 @@ class Obstacle(ContactPartner):
             x = group_points(dofs)[:, : dofs.bs]
             found = replace(found, place=relative_motion(found, dofs, x))
         return self._with_gaps_and_friction(dofs, found, reach, np.inf)
+
+    def _beside_edges(self, facets: Facets, distance: Array, towards: Array) -> tuple[Array, Array]:
+        """Return normals a little inside of facets, and at which corners they replace ``towards``.
+
+        These are corners at an edge of the shape, where it has no normal: that of the facet decides
+        which side's counts.
+        """
+        corners, gdim = facets.corners, towards.shape[1]
+        off = SEARCH.at_edge * facets.radius
+        at = np.flatnonzero(np.abs(distance) <= np.repeat(off, corners.shape[1]))
+        inside = corners + 2.0 * SEARCH.at_edge * (corners.mean(axis=1)[:, None] - corners)
+        _, beside = self._distances(inside.reshape(-1, corners.shape[2])[at], gdim)
+        own, towards = np.repeat(facets.normal, corners.shape[1], axis=0)[at], towards[at]
+        edge = np.sum(beside * towards, axis=1) < SEARCH.edge
+        edge &= np.sum((beside - towards) * own, axis=1) > 0.0
+        return beside[edge], at[edge]
 
     def _distances(self, x: Array, gdim: int) -> tuple[Array, Array]:
         """Return distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""

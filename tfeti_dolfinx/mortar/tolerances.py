@@ -15,6 +15,7 @@ class SearchTolerances:
     # cosine of 20°: facets that turn by twice that at a vertex have an edge there, others are those
     # of a smooth surface, with nine facets or more around a pin
     edge: float = 0.94
+    at_edge: float = 1e-3  # of a facet's radius: a vertex so near an edge of a shape lies on it
     # of a cosine: facets that turn by less are parts of a plane
     turned: float = 8.0 * float(np.finfo(float).eps)
     # curvatures that are known by less of a neighbour's weight are taken to be 0
