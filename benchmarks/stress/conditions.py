@@ -1,8 +1,9 @@
 """Conditions of a scene on the untorn mesh, written anew: N u ≤ gap, slips T u, friction's bounds.
 
 Nothing is shared with the package but the definition (docs/theory.md): on what is covered of a
-secondary facet ψ = D M⁻¹φ, and n·(u_i − Σ_j ∫ψ_i φ_j u_j / ∫φ_i) ≤ the distance of the planes. At
-walls conditions are nodal, but of degree 2 Σ_k ∫ψ_i N_k u_k / ∫φ_i takes the place of u_i.
+secondary facet ψ = D M⁻¹φ, but φ near what is held where no vertices match, points at vertices that
+both sides hold, and n·(Σ_k ∫ψ_i φ_k u_k − Σ_j ∫ψ_i φ_j u_j) / ∫φ_i ≤ the distance of the planes.
+At walls conditions are nodal, but of degree 2 Σ_k ∫ψ_i N_k u_k / ∫φ_i takes the place of u_i.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from benchmarks.stress.scene import Scene, Side, wall_distance
 
 HARDLY_COVERED = 1e-6  # of a node's ∫φ_i: no condition, docs/theory.md
 SLIVER = 1e-13  # of a facet's area: nothing is shared
+ROUNDING = 1e-6  # of shape functions
 
 # weights of nodes (c × n), normals (c × gdim), gaps, ∫φ over what is covered, law of friction
 Block = tuple[csr_array, np.ndarray, np.ndarray, np.ndarray, tuple[str, float] | None]
@@ -41,15 +43,17 @@ class Conditions:
         return bool(self.given.any() or self.coefficient.any())
 
 
-def conditions(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Conditions:
+def conditions(scene: Scene, x: np.ndarray, facets_of: FacetsOf, fixed: np.ndarray) -> Conditions:
     """The conditions: at vertices of walls, and of pairs by mortar.
 
     Args:
         scene: The scene.
         x: Nodes, shape ``(n, 3)``.
         facets_of: Vertices and nodes of a side's facets.
+        fixed: Whether a displacement is prescribed, shape ``(n * gdim,)``.
     """
-    found = [*_at_walls(scene, x, facets_of), *_of_pairs(scene, x, facets_of)]
+    fixed = fixed.reshape(-1, scene.gdim)
+    found = [*_at_walls(scene, x, facets_of, fixed), *_of_pairs(scene, x, facets_of, fixed)]
     if not found:
         none, rows = np.zeros(0), csr_array((0, len(x) * scene.gdim))
         return Conditions(rows, rows, none, none, none)
@@ -66,16 +70,20 @@ def conditions(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Conditions:
     return Conditions(N, T, np.concatenate(gaps), bounds[0] * np.concatenate(areas), bounds[1])
 
 
-def _at_walls(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Block]:
+def _at_walls(
+    scene: Scene, x: np.ndarray, facets_of: FacetsOf, fixed: np.ndarray
+) -> Iterator[Block]:
     for wall in scene.walls:
         vertices, nodes = facets_of(wall.side)
         area, M = np.zeros(len(x)), csr_array((len(x), len(x)))
+        normals = -wall_distance(wall, x.T)[1].T[:, : scene.gdim]
+        held = np.all(fixed | (abs(normals) <= ROUNDING), axis=1) & (scene.order == 2)
         for own in zip(vertices, nodes, strict=True):  # each in its own plane
             first = x[own[0][0]]
             basis = np.linalg.qr((x[own[0][1 : scene.gdim]] - first).T)[0]
             facet, every = (Facet(of, (x[of] - first) @ basis, len(own[0])) for of in own)
-            parts = mortar([facet], [every], len(x))
-            area, M = area + parts[0], M + parts[1]
+            parts = mortar([facet], [every], held)
+            area, M = area + parts[0], M + parts[2]
         at = np.flatnonzero(area)
         W = eye_array(len(x), format="csr")[at]
         if scene.order == 2:
@@ -86,7 +94,9 @@ def _at_walls(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Bloc
         yield W, normals, distance / length, area[at], wall.friction
 
 
-def _of_pairs(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Block]:
+def _of_pairs(
+    scene: Scene, x: np.ndarray, facets_of: FacetsOf, fixed: np.ndarray
+) -> Iterator[Block]:
     for pair in scene.pairs:
         _, axis, end = pair.secondary
         sign = 1.0 if end else -1.0
@@ -96,9 +106,9 @@ def _of_pairs(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Bloc
             facets.append([Facet(n, x[n][:, across], len(n)) for n in facets_of(side)[0]])
             box = scene.bodies[side[0]]
             at.append((box.low, box.high)[side[2]][axis])
-        area, M = mortar(*facets, len(x))
+        area, D, M = mortar(*facets, fixed[:, axis])
         met = np.flatnonzero(area)
-        W = eye_array(len(x), format="csr")[met] - diags_array(1.0 / area[met]) @ M[met]
+        W = diags_array(1.0 / area[met]) @ (D - M)[met]
         normals = np.tile(sign * np.eye(scene.gdim)[axis], (len(met), 1))
         yield (
             csr_array(W),
@@ -121,19 +131,22 @@ def _rows(W: csr_array, axes: np.ndarray) -> csr_array:
     return found
 
 
-def mortar(secondary: list[Facet], primary: list[Facet], size: int) -> tuple[np.ndarray, csr_array]:
-    """∫φ_i over the covered part, and ∫ψ_i φ_j.
+def mortar(
+    secondary: list[Facet], primary: list[Facet], held: np.ndarray
+) -> tuple[np.ndarray, csr_array, csr_array]:
+    """∫φ_i over the covered part, and integrals of multipliers and shape functions.
 
     Args:
         secondary: Facets of the side that carries the multipliers.
         primary: Facets of the other side.
-        size: Number of nodes.
+        held: Whether nodes are held along the normal, shape ``(n,)``.
 
     Returns:
-        ∫φ_i of each node, 0 of those without a condition, ∫ψ_i φ_j of nodes i, j.
+        ∫φ_i of each node, 0 of those without a condition, ∫ψ_i φ_k of nodes i, k of the secondary
+        side, ∫ψ_i φ_j of nodes i, j of both sides.
     """
-    covered, whole = np.zeros((2, size))
-    entries = list[np.ndarray]()
+    covered, whole = np.zeros((2, len(held)))
+    entries: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for s in secondary:
         y, w = s.rule(s.polygon)
         whole[s.nodes] += w @ s.hats(y)
@@ -146,13 +159,49 @@ def mortar(secondary: list[Facet], primary: list[Facet], size: int) -> tuple[np.
         d = w @ phi
         covered[s.nodes] += d
         psi_of_phi = d[:, None] * np.linalg.inv((phi * w[:, None]).T @ phi)
+        near = [f for f in (s, *(p for p, *_ in shared)) if held[f.nodes].any()]
+        if near and not (len(shared) == 1 and s.matches(shared[0][0])):
+            psi_of_phi = np.eye(len(d))
+        spots, moved = _points(s, [p for p, *_ in shared], held)
+        at_points = np.eye(len(d)) - moved
         for p, y, w in shared:
-            m = psi_of_phi @ (s.hats(y) * w[:, None]).T @ p.hats(y)
-            i, j = np.meshgrid(s.nodes, p.nodes, indexing="ij")
-            entries.append(np.stack((m, i, j)).reshape(3, -1))
+            psi = moved @ psi_of_phi @ (s.hats(y) * w[:, None]).T
+            own, other = psi @ s.hats(y), psi @ p.hats(y)
+            for k, here in spots.items():
+                if p in here:
+                    share, at = at_points[:, [k]] * d[k] / len(here), s.x[k : k + 1]
+                    own, other = own + share @ s.hats(at), other + share @ p.hats(at)
+            for f, m, into in zip((s, p), (own, other), entries, strict=True):
+                i, j = np.meshgrid(s.nodes, f.nodes, indexing="ij")
+                into.append(np.stack((m, i, j)).reshape(3, -1))
     covered[covered <= HARDLY_COVERED * whole] = 0.0
-    m, i, j = np.concatenate(entries, axis=1) if entries else np.zeros((3, 0))
-    return covered, csr_array((m, (i.astype(int), j.astype(int))), shape=(size, size))
+    tables = (np.concatenate(of, axis=1) if of else np.zeros((3, 0)) for of in entries)
+    D, M = (csr_array((m, (i.astype(int), j.astype(int))), (len(held),) * 2) for m, i, j in tables)
+    return covered, D, M
+
+
+def _points(
+    s: Facet, shared: list[Facet], held: np.ndarray
+) -> tuple[dict[int, list[Facet]], np.ndarray]:
+    """Vertices of a facet that both sides hold with facets there, and who takes their multipliers.
+
+    Multipliers are moved by a matrix of ones and shares: to vertices along edges, if not all of
+    these are held, too; where all are, to the first.
+    """
+    spots = {}
+    for k in np.flatnonzero(held[s.nodes]):
+        values = {p: p.hats(s.x[k : k + 1])[0] for p in shared}
+        here = [p for p in shared if values[p].min() >= -ROUNDING]
+        if here and all(abs(values[p]) @ ~held[p.nodes] <= ROUNDING for p in here):
+            spots[int(k)] = here
+    if len(spots) == len(s.nodes):
+        del spots[0]
+    moved, rest = np.eye(len(s.nodes)), [k for k in range(len(s.nodes)) if k not in spots]
+    for k in spots:
+        # of a rectangle corners along an edge, of a triangle all
+        along = [j for j in rest if len(s.x) < 4 or np.any(s.x[j] == s.x[k])]
+        moved[k, k], moved[along or rest, k] = 0.0, 1.0 / len(along or rest)
+    return spots, moved
 
 
 class Facet:
@@ -165,7 +214,7 @@ class Facet:
     """
 
     def __init__(self, nodes: np.ndarray, x: np.ndarray, corners: int) -> None:
-        self.nodes, vertices = nodes, x[:corners]
+        self.nodes, self.x, vertices = nodes, x, x[:corners]
         self.low, self.high = vertices.min(axis=0), vertices.max(axis=0)
         self._origin, dim = x[0], x.shape[1]
         self._inverse = np.linalg.inv((x[1 : dim + 1] - x[0]).T)
@@ -187,6 +236,11 @@ class Facet:
     def hats(self, y: np.ndarray) -> np.ndarray:
         """Shape functions of the nodes at points, shape ``(q, v)``."""
         return self._shapes(y) @ self._to_nodes
+
+    def matches(self, other: Facet) -> bool:
+        """Whether the facets have the same vertices."""
+        away = abs(self.x[:, None] - other.x).max(axis=2).min(axis=1).max()
+        return len(self.x) == len(other.x) and away <= ROUNDING * (self.high - self.low).max()
 
     def near(self, other: Facet) -> bool:
         """Whether the boxes of the facets overlap."""

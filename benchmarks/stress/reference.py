@@ -91,7 +91,7 @@ class Untorn:
             dofs, own = bc.dof_indices()
             self.fixed[dofs[:own]] = True
             bc.set(self.values)
-        self.conditions = conditions(scene, self.x, self._facet_nodes)
+        self.conditions = conditions(scene, self.x, self._facet_nodes, self.fixed)
         self.rows, self.gap = self.conditions.N, self.conditions.gap
         boxes = [np.subtract(b.high, b.low) for b in scene.bodies]
         self.length = float(min(box.max() for box in boxes))

@@ -7,9 +7,12 @@ import numpy as np
 from reference.untorn import Conditions, two_boxes
 
 
-def mortar_1d(secondary, primary):
-    """Integrals ∫φ_i and ∫ψ_i φ_j of two meshes of the same interval, segment by segment."""
-    D, M = np.zeros(len(secondary)), np.zeros((len(secondary), len(primary)))
+def mortar_1d(secondary, primary, hats, low=0.0, high=1.0):
+    """Integrals ∫ψ_i φ_k and ∫ψ_i φ_j of two meshes of the same interval, segment by segment.
+
+    Over the secondary facets that begin between low and high; hats or dual multipliers.
+    """
+    D, M = (np.zeros((len(secondary), len(mesh))) for mesh in (secondary, primary))
     cuts = np.unique(np.concatenate((secondary, primary)).round(12))
     gauss, weight = np.polynomial.legendre.leggauss(3)
     for a, b in pairwise(cuts):
@@ -18,16 +21,16 @@ def mortar_1d(secondary, primary):
             j = np.searchsorted(primary, y) - 1
             t = (y - secondary[i]) / (secondary[i + 1] - secondary[i])
             s = (y - primary[j]) / (primary[j + 1] - primary[j])
-            for k, psi, phi in ((i, 2 - 3 * t, 1 - t), (i + 1, 3 * t - 1, t)):
-                D[k] += w * phi
-                M[k, j] += w * psi * (1 - s)
-                M[k, j + 1] += w * psi * s
+            psi = np.array([1 - t, t] if hats else [2 - 3 * t, 3 * t - 1])
+            if low <= secondary[i].round(12) < high:
+                D[i : i + 2, i : i + 2] += w * np.outer(psi, (1 - t, t))
+                M[i : i + 2, j : j + 2] += w * np.outer(psi, (1 - s, s))
     return D, M
 
 
 def lever(cell, n_lower, n_upper, push, pull, secondary):
     """The lever of ``test_mortar``: points and displacements of its nodes, those of the secondary
-    side, and their forces."""
+    side, and their forces. Multipliers are hats up to the end of the facets that are held."""
     gdim = 2 if cell == "quadrilateral" else 3
     scene = two_boxes(
         cell,
@@ -41,14 +44,17 @@ def lever(cell, n_lower, n_upper, push, pull, secondary):
     if secondary == "lower":
         sides, n = sides[::-1], n[::-1]
     own, others = (scene.side(name)[0] for name in sides)
-    D, M = mortar_1d(*(np.linspace(0, 1, k + 1) for k in n))
+    meshes, end = [np.linspace(0, 1, k + 1) for k in n], round(1.0 / n_upper, 12)
+    parts = [mortar_1d(*meshes, hats, *x) for hats, x in ((True, (0.0, end)), (False, (end, 1.0)))]
     if gdim == 3:  # nodes sorted by y, then x
-        D, M = np.kron(D, D), np.kron(M, M)
+        across = [mortar_1d(*meshes, hats) for hats in (True, False)]
+        parts = [map(np.kron, *two) for two in zip(across, parts, strict=True)]
+    D, M = map(sum, zip(*parts, strict=True))
     entries = [
-        {int(node): D[i], **{int(other): -M[i, j] for j, other in enumerate(others)}}
-        for i, node in enumerate(own)
+        {int(node): W for node, W in zip((*own, *others), (*D[i], *-M[i]), strict=True)}
+        for i in range(len(own))
     ]
     frame = np.vstack((down * np.eye(gdim)[-1], np.eye(gdim)[:-1]))
     met = Conditions(scene, entries, 0.0, np.zeros(gdim - 1), frame)
     u = met.solve()
-    return scene.x[scene.order], u, scene.x[own], met.force[:, 0] * D
+    return scene.x[scene.order], u, scene.x[own], met.force[:, 0] * D.sum(axis=1)

@@ -473,8 +473,7 @@ class Contact(ContactPartner):
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
-            closed = not isinstance(self.gap, str)
-            integrals = integrate(kind, secondary, primary, segments, closed)
+            integrals = integrate(kind, secondary, primary, segments)
         averted = comm.allreduce(int(segments.averted))
         if averted and comm.allreduce(len(segments.weight)) == 0:
             raise InputError(

@@ -1,4 +1,4 @@
-"""Mortar integrals with dual multipliers, between facets or the smooth surfaces through them."""
+"""Mortar integrals of multipliers, between facets or the smooth surfaces through them."""
 
 from __future__ import annotations
 
@@ -138,16 +138,15 @@ class MortarIntegrals:
     covered: Array  # ∫φ_i over the covered part of each facet, shape (f, v)
     gap: GapIntegrals  # gap g along the node's normal, between the facets or of an obstacle
     curved_gap: GapIntegrals  # that between the smooth surfaces that facets stand for
-    # triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign), ψ_i the dual
-    # multipliers
+    # triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign)
     entries: tuple[Triplets, ...]
     # triplets (group of a vertex whose multiplier is a point, a neighbour's group, share of ∫φ_d)
     shares: Triplets
 
 
 @dataclass(frozen=True)
-class DualMultipliers:
-    """Values of dual multipliers at quadrature points."""
+class FacetMultipliers:
+    """Values of multipliers at quadrature points: dual ones, or hats near what is held."""
 
     facet: Array  # facets that have points, shape (f,)
     place: Array  # place in `facet` of each point's facet, shape (m,)
@@ -162,51 +161,48 @@ class DualMultipliers:
         weighted = self.weighted.reshape(*self.weighted.shape, *extra)
         return sum_rows(self.place, weighted * values[:, None], len(self.facet))
 
-    def passed_on(
-        self, kind: FacetKind, level: Array, spot: Array, vertex: Array
-    ) -> tuple[DualMultipliers, Array]:
-        """Multipliers of which those at vertices that are held have passed on to neighbours.
+    def with_points(
+        self, kind: FacetKind, held: Array, spot: Array, vertex: Array
+    ) -> tuple[FacetMultipliers, Array]:
+        """Multipliers of which those at vertices that both sides hold have become points.
 
-        On each facet vertices that are held on both sides, to which ``level`` of shape ``(f, v)``
-        adds up, pass on to those that are not, where all are to the first. Where there is a spot,
-        ``vertex`` of the facet ``facet[spot]``, ψ_d becomes D_d times a Dirac there, and the
-        neighbours get the rest; else they get all of it. The sum of all stays, and so do integrals
-        of what is linear. Return also which spots are points now, the last ones.
+        On a facet ψ_d of such a vertex d, by flags of shape ``(f, v)``, becomes D_d δ_d, and its
+        neighbours share ψ_d − D_d δ_d; where all are held the first one takes that. So the sum of
+        all stays. Each of these d has spots: ``vertex`` of the facet ``facet[spot]``. Return also
+        which spots are points now, the last ones.
         """
-        v, level = level.shape[1], np.array(level, dtype=float)
-        level[level.min(axis=1) > 2.0 - SEARCH.mostly, 0] -= 1.0
-        held = level > np.maximum(level.min(axis=1) + SEARCH.held, 1.0 + SEARCH.mostly)[:, None]
+        v, held = held.shape[1], held.copy()
+        held[held.all(axis=1), 0] = False
         to = np.repeat(~held[:, :, None], v, axis=2)
         beside = to & kind.hats.neighbours
         to = np.where(beside.any(axis=1, keepdims=True), beside, to) & held[:, None]
         share = to / np.maximum(to.sum(axis=1, keepdims=True), 1)
-        at = np.zeros(held.shape)
-        np.add.at(at, (spot, vertex), 1.0)
-        whole = np.where(held & (at == 0.0), self.covered, 0.0)
         used = held[spot, vertex]
         spot, vertex = spot[used], vertex[used]
+        at = np.zeros(held.shape)
+        np.add.at(at, (spot, vertex), 1.0)
         dirac = np.eye(v)[vertex] - share[spot, :, vertex]
         dirac *= (self.covered[spot, vertex] / at[spot, vertex])[:, None]
         keeps = np.eye(v) * ~held[:, None] + share
         weighted = np.einsum("mij,mj->mi", keeps[self.place], self.weighted)
-        return DualMultipliers(
-            facet=self.facet,
+        return replace(
+            self,
             place=np.append(self.place, spot),
             weighted=np.concatenate((weighted, dirac)),
-            covered=self.covered - whole + np.einsum("fij,fj->fi", share, whole),
-            shares=share.swapaxes(1, 2) * np.where(at > 0.0, self.covered, 0.0)[:, :, None],
+            shares=share.swapaxes(1, 2) * self.covered[:, :, None],
         ), used
 
 
-def dual_multipliers(
-    kind: FacetKind, area: Array, facet: Array, xi: Array, weight: Array
-) -> DualMultipliers:
-    """Multipliers that are biorthogonal to the hats on the part of a facet with points.
+def facet_multipliers(
+    kind: FacetKind, area: Array, facet: Array, xi: Array, weight: Array, near: Array
+) -> FacetMultipliers:
+    """Multipliers on a facet's part with points: hats if it is near what is held, else dual ones.
 
-    ψ = D_e M_e⁻¹ φ with D_e = diag ∫φ_i and M_e = ∫φ_i φ_j there. They sum up to 1, so a uniform
-    pressure is met (Wohlmuth, SIAM J. Numer. Anal. 38, 2000; Cichosz, Bischoff, Comput. Methods
-    Appl. Mech. Eng. 200, 2011). A facet that is hardly covered, by its area, has no share. Points
-    have their facet, reference coordinates of shape ``(m, tdim)`` and a weight.
+    Those are biorthogonal to the hats, ψ = D_e M_e⁻¹ φ with D_e = diag ∫φ_i and M_e = ∫φ_i φ_j
+    there. Both sum up to 1, so a uniform pressure is met (Wohlmuth, SIAM J. Numer. Anal. 38, 2000;
+    Cichosz, Bischoff, Comput. Methods Appl. Mech. Eng. 200, 2011). A facet that is hardly covered,
+    by its area, has no share. Points have their facet, reference coordinates of shape ``(m, tdim)``
+    and a weight; ``near`` has flags of each facet's vertices.
     """
     facets, place = np.unique(facet, return_inverse=True)
     hats = kind.hats.values(xi)
@@ -216,9 +212,10 @@ def dual_multipliers(
     mass[hardly] = np.eye(kind.hats.size)
     covered[hardly] = 0.0
     dual = covered[:, :, None] * np.linalg.inv(mass)
+    dual[np.any(near[facets], axis=1) & ~hardly] = np.eye(kind.hats.size)
     psi = np.einsum("mij,mj->mi", dual[place], hats)
     shares = np.zeros(mass.shape)
-    return DualMultipliers(facets, place, weight[:, None] * psi, covered, shares)
+    return FacetMultipliers(facets, place, weight[:, None] * psi, covered, shares)
 
 
 def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
@@ -228,18 +225,21 @@ def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
 
 
 def integrate(
-    kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments, closed: bool
+    kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments
 ) -> MortarIntegrals:
-    """Return integrals of the secondary facets' dual multipliers over segments.
-
-    Surfaces are closed to each other, wherever the facets are, if gaps are given.
-    """
+    """Return integrals of the secondary facets' multipliers over segments."""
     at = segments.points
-    dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
-    if np.any(secondary.held) and (np.any(primary.held) or kind.displacement.degree > 1):
-        corners = segments.corners
-        level, corner, *spots = _held(kind, (secondary, primary), corners, dual.facet, closed)
-        dual, used = dual.passed_on(kind, level, *spots)
+    corners, near = segments.corners, secondary.held.copy()
+    near[at.secondary[np.any(primary.held[at.primary], axis=1)]] = True
+    if kind.displacement.degree == 1:  # where facets meet vertex to vertex dual rows are of nodes
+        hats = [kind.hats.values(xi).max(axis=1, initial=0.0) for xi in (corners.xi, corners.eta)]
+        meet = np.ones(len(secondary), dtype=bool)
+        meet[corners.secondary[np.minimum(*hats) < 1.0 - SEARCH.held]] = False
+        near[meet] = False
+    dual = facet_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight, near)
+    if np.any(secondary.held) and np.any(primary.held):
+        corner, *held = _held(kind, (secondary, primary), corners, dual.facet)
+        dual, used = dual.with_points(kind, *held)
         at = at.and_also(corners, corner[used])
         segments = replace(segments, points=at)
     gap = curved_gap = _gaps(kind, secondary, primary, segments, dual)
@@ -264,17 +264,17 @@ def integrate(
 
 
 def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> MortarIntegrals:
-    """Return integrals of the dual multipliers over whole facets that face an obstacle.
+    """Return integrals of the multipliers over whole facets that face an obstacle.
 
     ``distance`` is that of the obstacle at their vertices, shape ``(n, v)``.
     """
     # exact for ψ_i φ_k on plane facets, and enough on curved ones
     facet, xi, weight = whole_facets(kind, facets, 4 * kind.displacement.degree)
-    dual = dual_multipliers(kind, facets.area, facet, xi, weight)
-    if kind.displacement.degree > 1 and np.any(facets.held):
-        held = facets.held[dual.facet]
-        spot, vertex = np.nonzero(held)
-        dual, used = dual.passed_on(kind, 2.0 * held, spot, vertex)  # an obstacle does not bend
+    held = facets.held & (kind.displacement.degree > 1)
+    dual = facet_multipliers(kind, facets.area, facet, xi, weight, held)
+    if np.any(held):
+        spot, vertex = np.nonzero(held[dual.facet])
+        dual, used = dual.with_points(kind, held[dual.facet], spot, vertex)
         xi = np.concatenate((xi, kind.hats.points[vertex[used]]))
     at_vertices, vertices = distance[dual.facet], facets.vertices[dual.facet]
     gap = GapIntegrals(at_vertices * dual.covered, at_vertices, at_vertices)
@@ -283,7 +283,7 @@ def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> Mort
     return MortarIntegrals(vertices, dual.covered, gap, gap, (entries,), _shares(facets, dual))
 
 
-def _shares(facets: Facets, dual: DualMultipliers) -> Triplets:
+def _shares(facets: Facets, dual: FacetMultipliers) -> Triplets:
     """Return shares of neighbours as triplets of groups."""
     vertices = facets.vertices[dual.facet]
     of, to, share = triplets(vertices, vertices, dual.shares)
@@ -291,38 +291,22 @@ def _shares(facets: Facets, dual: DualMultipliers) -> Triplets:
 
 
 def _held(
-    kind: FacetKind, sides: tuple[Facets, Facets], at: FacingPoints, facet: Array, closed: bool
+    kind: FacetKind, sides: tuple[Facets, Facets], at: FacingPoints, facet: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """On how many sides facets are held at their vertices.
+    """Return vertices that both sides hold, and the corners of common parts that are at vertices.
 
-    Both are looked at where a corner of common parts is next to the vertex, the primary one by the
-    share of its hats that is held; what is far apart there counts as free, unless gaps are given.
-    What one side alone holds bears the other one, and stays, but where a secondary trace of a
-    degree above 1 bends beside a vertex that is held: it counts as held on both, to be a point.
-    Return also the corners that are at a vertex, the place of their facet, and the vertex; not
-    where the primary side is nearly held, since what moves there would do so in a row of its own.
+    First the corners, then flags of vertices of the facets, shape ``(f, v)``, the place of each
+    corner's facet, and its vertex.
     """
     secondary, primary = sides
     place = np.searchsorted(facet, at.secondary)
-    hats = kind.hats.values(at.xi)
-    nearest = np.zeros((len(facet), hats.shape[1]))
-    np.maximum.at(nearest, place, hats)
-    near = hats > nearest[place] - SEARCH.held
-    free = np.sum(np.abs(kind.hats.values(at.eta)) * ~primary.held[at.primary], axis=1)
-    own = secondary.held[at.secondary]
-    apart = np.linalg.norm(_apart(kind, secondary, primary, at, False), axis=1)
-    close = closed | (apart <= SEARCH.together * secondary.radius[at.secondary])
-    level = np.full(nearest.shape, 2.0)
-    held = (1.0 - free[:, None] + own) * close[:, None]
-    np.minimum.at(level, place, np.where(near, held, 2.0))
-    nearly = (free > SEARCH.held) & (free <= SEARCH.mostly)
-    corner, vertex = np.nonzero(near & (hats > 1.0 - SEARCH.held) & ~nearly[:, None])
-    if kind.displacement.degree > 1:
-        bends = np.zeros(level.shape, dtype=bool)
-        bends[place[corner], vertex] = close[corner]
-        held_here = secondary.held[facet]
-        level[bends & held_here & ~held_here.all(axis=1, keepdims=True)] = 2.0
-    return level, corner, place[corner], vertex
+    corner, vertex = np.nonzero(kind.hats.values(at.xi) > 1.0 - SEARCH.held)
+    free = np.sum(np.abs(kind.hats.values(at.eta)) * ~primary.held[at.primary], axis=1)[corner]
+    held = np.zeros((len(facet), kind.hats.size), dtype=bool)
+    held[place[corner], vertex] = True
+    held &= secondary.held[facet]
+    held[place[corner[free > SEARCH.held]], vertex[free > SEARCH.held]] = False
+    return corner, held, place[corner], vertex
 
 
 def _gaps(
@@ -330,7 +314,7 @@ def _gaps(
     secondary: Facets,
     primary: Facets,
     segments: Segments,
-    dual: DualMultipliers,
+    dual: FacetMultipliers,
     curved: bool = False,
 ) -> GapIntegrals:
     """Return gaps over segments, between the facets or the smooth surfaces that they stand for."""
@@ -367,7 +351,7 @@ def _apart(
 
 
 def _range(
-    dual: DualMultipliers, normals: Array, facet: Array, apart: Array, whole: Array
+    dual: FacetMultipliers, normals: Array, facet: Array, apart: Array, whole: Array
 ) -> tuple[Array, Array]:
     """Smallest and largest n_i·(x_p − x_s) that multipliers weigh on each facet; ∞ covered in part.
 

@@ -37,11 +37,6 @@ class SearchTolerances:
     # components of a unit normal that need not be prescribed where a vertex is held; shares of hats
     # that what is held may lack
     held: float = 1e-6
-    # share of hats from which on a point counts as held: openings from farther off let multipliers
-    # have gaps that are positive (from 0.41 of a facet on where it is quadratic)
-    mostly: float = 0.5
-    # of a facet's radius: sides that are farther apart at a vertex that is held do not close there
-    together: float = 0.2
     same_layer: float = 1e-9  # distances closer than this are those of facets of one layer
     covered_twice: float = 1e-6  # common parts that exceed a facet by less are one layer
     # cosine, of about 92°: facets seen from the side have only slivers in common
