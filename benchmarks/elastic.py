@@ -4,10 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
+import basix.ufl
+import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
+
+
+def triangles(points: Any, cells: Any) -> dmesh.Mesh:
+    """A mesh of triangles, shapes ``(n, 2)`` and ``(m, 3)``."""
+    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
+    return dmesh.create_mesh(MPI.COMM_WORLD, cells=cells.astype(np.int64), x=points, e=element)
 
 
 class Elastic:
@@ -71,3 +81,14 @@ class Elastic:
     def problem(self, contacts: list[Any], **options: Any) -> tfeti.ContactProblem:
         """The linear problem, to rtol 1e-8."""
         return tfeti.ContactProblem(**self.parts(contacts), petsc_options={"rtol": 1e-8, **options})
+
+    def plastic(
+        self, contacts: list[Any], rtol: float, **law: float
+    ) -> tuple[tfeti.J2Plasticity, tfeti.NonlinearContactProblem]:
+        """J2 plasticity of these numbers, and its problem."""
+        u = fem.Function(self.V)
+        steel = tfeti.J2Plasticity(self.elastic, u, **law)
+        given = {"J": steel.tangent(self.u, self.v), "state": steel.state, "update": steel.update}
+        given["petsc_options"] = {"rtol": rtol}
+        residual, d = steel.residual(self.v), self.decomposition
+        return steel, tfeti.NonlinearContactProblem(residual, u, self.bcs, contacts, d, **given)

@@ -68,7 +68,7 @@ def _line() -> Scene:
         build=lambda n, mesh: half_cylinder.build(R, **grading(n, mesh, a)),
         make=make,
         samples=samples,
-        exact=samples.exact(LINE.pressure),
+        exact=LINE.pressure(samples.distance),
     )
 
 
@@ -88,7 +88,7 @@ def _ball() -> Scene:
         build=lambda n, mesh: half_ball.build(R, **grading(n, mesh, a, 1.5)),
         make=make,
         samples=samples,
-        exact=samples.exact(POINT.pressure),
+        exact=POINT.pressure(samples.distance),
         place=lambda points: points[:, :2],
     )
 
@@ -114,7 +114,7 @@ def _cylinder() -> Scene:
         build=lambda n, mesh: cylinder_on_block.build(radius, 4 * radius, **grading(n, mesh, a)),
         make=make,
         samples=samples,
-        exact=samples.exact(hertz.pressure),
+        exact=hertz.pressure(samples.distance),
         young=lambda points: np.where(points[:, 1] > 0.0, young["cylinder"], young["block"]),
     )
 
@@ -161,7 +161,7 @@ def _punch() -> Scene:
         build=lambda n, mesh: half_planes.build(L, **grading(n, mesh, PUNCH.half_width)),
         make=make,
         samples=samples,
-        exact=samples.exact(PUNCH.pressure),
+        exact=PUNCH.pressure(samples.distance),
     )
 
 
@@ -188,7 +188,7 @@ def _slip() -> Scene:
         build=lambda n, mesh: half_planes.build(L, **grading(n, mesh, PAIR.half_width)),
         make=make,
         samples=samples,
-        exact=samples.exact(left.pressure),
+        exact=left.pressure(samples.distance),
         force=lambda data: MU * data.pressure - np.linalg.norm(data.tangential_traction, axis=1),
         solve=solve,
     )

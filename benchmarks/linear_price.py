@@ -103,7 +103,7 @@ def linear_problem(made, solution):
 
 
 def untorn(K, dofs):
-    """The stiffness of the untorn mesh: entries of torn copies added. Collective."""
+    """The stiffness of the untorn mesh, with its rigid motions: copies are added. Collective."""
 
     def parallel(local, csr):
         sizes = tuple((size, None) for size in local)
@@ -121,17 +121,12 @@ def untorn(K, dofs):
     torn.destroy()
     copies.destroy()
     A.setOption(PETSc.Mat.Option.SPD, True)
-    A.setNearNullSpace(rigid_motions(A, dofs))
-    return A
-
-
-def rigid_motions(A, dofs):
-    """Rigid motions of the untorn mesh, as a near null space of its stiffness. Collective."""
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, : dofs.bs]
     points = A.createVecRight()
     points.setBlockSize(dofs.bs)
     points.array[:] = dofs.reduce(x, np.maximum).ravel()
-    return PETSc.NullSpace().createRigidBody(points)
+    A.setNearNullSpace(PETSc.NullSpace().createRigidBody(points))
+    return A
 
 
 def linear_row(linear, key, rtol):
@@ -220,7 +215,7 @@ def contact(made, qp_type, options):
         "steps": f"{report.F_multiplications} F + {report.preconditioner_multiplications} S",
         "set-up": report.seconds["factors"],
         "solve": report.seconds["coarse"] + report.seconds["solve"],
-        "all": solve_seconds({"seconds": report.seconds}),
+        "all": solve_seconds(vars(report)),
         "error": report.residuals["displacement_error"],
     }
     say(row)
@@ -287,12 +282,8 @@ def main(argv):
         rows, report = study(made, options, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"
         tables[f"{name}: {sizes}, {ranks} ranks, {unit}"] = with_ratios(rows)
-
-    def shown(found):
-        """The tables by the names of their demos."""
-        return {title.split(":")[0]: rows for title, rows in found.items()}
-
-    return finish(arguments, "linear_price", tables, draw, shown)
+    named = {title.split(":")[0]: rows for title, rows in tables.items()}
+    return finish(arguments, "linear_price", tables, draw, lambda _: named)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ It needs numpy and scipy only, so that other programs' pressures are judged by t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -152,10 +151,6 @@ class Samples:
             return np.interp(self.points[:, 0], x[order], pressure[order], left=0.0, right=0.0)
         around = float(self.weights.sum())
         return np.interp(self.points[:, 0], x, pressure, period=around)
-
-    def exact(self, pressure: Callable[[Array], Array]) -> Array:
-        """A closed form, a function of the distance from the middle, at the samples."""
-        return pressure(self.distance)
 
 
 def errors(samples: Samples, found: Array, exact: Array) -> dict[str, float | None]:

@@ -10,9 +10,9 @@ package says that it has a solution and the direct solver finds it.
 A solve fails that ends in an error, in more than ``--steps`` steps, after more than ``--limit``
 seconds (on one rank), or with an error above 100 rtol (and 100 times what rounding does) beside the
 direct solution. Where rounding of the stiffness alone changes that by more than rtol no solver can
-be right to rtol: such solves are in a table of their own. A profile ρ(τ) is the share of solves
-that a solver ends for at most τ times the multiplications, by F and by the preconditioner, of the
-best one (Mathematical Programming 91, 2002). Results go to results/solver_profiles.md and .json.
+be right to rtol: such solves are left out. A profile ρ(τ) is the share of solves that a solver ends
+for at most τ times the multiplications, by F and by the preconditioner, of the best one
+(Mathematical Programming 91, 2002). Results go to results/solver_profiles.md and .json.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ from benchmarks.tools import command_line, finish, limited, say
 
 # of scenes with contact and without, the default first
 SOLVERS = {
-    True: ["newton, dirichlet", "newton, lumped", "newton, none", "smalse, none"],
-    False: ["pcpg, dirichlet", "pcpg, lumped", "pcpg, none"],
+    "contact": ["newton, dirichlet", "newton, lumped", "newton, none", "smalse, none"],
+    "no contact": ["pcpg, dirichlet", "pcpg, lumped", "pcpg, none"],
 }
 TOLERANCES = (1e-4, 1e-8)
 WITHIN = 100.0  # of rtol, and of the noise of the direct solution
 NEAR = 2.0  # of the best
+WHY = ", failed"  # of a column
 TAUS = (1.0, 1.5, 2.0, 4.0, 8.0, 16.0)
 BEAMS, MODULI = (2.0, 5.0, 10.0, 20.0, 50.0), (1.0, 1e2, 1e4)
 
@@ -65,21 +66,8 @@ def scenes(count: int, seed: int, quick: bool) -> Iterator[tuple[str, Scene]]:
             yield f"blocks {cell} {ratio:g}", with_friction(scene, "tresca", 1e-3)
 
 
-def described(name: str, scene: Scene) -> dict[str, Any]:
-    """Columns on a scene."""
-    laws = {c.friction[0] for c in (*scene.walls, *scene.pairs) if c.friction}
-    return {
-        "scene": name,
-        "kind": scene.note or name.split()[0],
-        "cell": scene.cell,
-        "bodies": len(scene.bodies),
-        "friction": ", ".join(laws) or "-",
-    }
-
-
-def cost(scene: Scene, g: meshes.Grid, answer: Answer | None, options: dict[str, Any]):
-    """Multiplications of a solve, None where it fails; and why."""
-    scene = replace(scene, options=options)
+def cost(scene: Scene, g: meshes.Grid, answer: Answer | None) -> tuple[int | None, str]:
+    """Multiplications of a solve, None where it fails; and why. Collective."""
     outcome = solve_scene(scene, g, MPI.COMM_WORLD)
     why = outcome.error
     if answer is not None and not why:
@@ -88,11 +76,10 @@ def cost(scene: Scene, g: meshes.Grid, answer: Answer | None, options: dict[str,
             wrong = np.maximum(found["errors"], found["jump"])
             # a body that does not move has what rounding of its points makes of that
             noise = np.maximum(found["noise"], found["of points"])
-            if np.any(wrong > WITHIN * np.maximum(options["tfeti_rtol"], noise)):
+            if np.any(wrong > WITHIN * np.maximum(scene.options["tfeti_rtol"], noise)):
                 why = f"wrong by {found['u']:.1e}"
-    if why := MPI.COMM_WORLD.bcast(why):
-        return None, why
-    return outcome.report["F"] + outcome.report["S"], ""
+    why = MPI.COMM_WORLD.bcast(why)
+    return None if why else outcome.report["F"] + outcome.report["S"], why
 
 
 def direct(scene: Scene, g: meshes.Grid, steps: int, limit: int) -> tuple[bool, Answer | None]:
@@ -110,73 +97,49 @@ def direct(scene: Scene, g: meshes.Grid, steps: int, limit: int) -> tuple[bool, 
 
 def study(name: str, scene: Scene, arguments: Any) -> list[dict[str, Any]]:
     """A row for each tolerance, with the costs of all solvers; none if the scene takes no part."""
-    solvers = SOLVERS[bool(scene.walls or scene.pairs)]
+    solvers = SOLVERS["contact" if scene.walls or scene.pairs else "no contact"]
     g, rows = meshes.grid(scene), list[dict[str, Any]]()
     takes_part, answer = direct(scene, g, arguments.steps, arguments.limit)
-    noise = float(answer.noise.max()) if answer is not None and answer.noise is not None else 0.0
-    for rtol in TOLERANCES if takes_part else ():
-        rows.append({**described(name, scene), "rtol": rtol, "noise": noise})
+    known = answer is not None and answer.noise is not None
+    noise = MPI.COMM_WORLD.bcast(float(answer.noise.max()) if known else 0.0)
+    for rtol in (rtol for rtol in TOLERANCES if takes_part and noise <= rtol):
+        rows.append({"scene": name, "rtol": rtol})
         for key in solvers[:1] if arguments.default else solvers:
             options = dict(zip(("tfeti_qp_type", "tfeti_pc_type"), key.split(", "), strict=True))
             options |= {"tfeti_rtol": rtol, "tfeti_max_it": arguments.steps}
+            solve = partial(cost, replace(scene, options=options), g, answer)
             try:
-                found = limited(arguments.limit, partial(cost, scene, g, answer, options))
+                found = limited(arguments.limit, solve)
             except TimeoutError as late:
                 found = None, str(late)
-            rows[-1] |= {key: found[0], f"{key}, failed": found[1]}
+            rows[-1] |= {key: found[0], key + WHY: found[1].replace("|", "/")}
         say(rows[-1])
     return rows
 
 
-def profiles(rows: list[dict[str, Any]], solvers: list[str]) -> list[dict[str, Any]]:
-    """A row for each solver: failures, and its profile at a few τ."""
-    values = np.array([[row[key] for key in solvers] for row in rows], dtype=float)
-    values[np.isnan(values)] = np.inf
-    # what no solver needs anything for is a tie
-    best = np.maximum(np.min(values, axis=1, keepdims=True), 1e-9)
-    with np.errstate(invalid="ignore"):
-        ratio = np.where(np.isinf(values), np.inf, np.maximum(values, 1e-9) / best)
-    return [
-        {
-            "solver": key,
-            "solves": len(rows),
-            "failed": int(np.isinf(values[:, k]).sum()),
-            **{f"τ = {tau:g}": float(np.mean(ratio[:, k] <= tau)) for tau in TAUS},
-        }
-        for k, key in enumerate(solvers)
-    ]
-
-
 def tabled(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Profiles, and what failed by default."""
-    tables: dict[str, list[dict[str, Any]]] = {}
-    reached = [row for row in rows if row["noise"] <= row["rtol"]]
-    for has_contact, solvers in SOLVERS.items():
-        if own := [row for row in reached if solvers[0] in row]:
-            tried = [key for key in solvers if all(key in row for row in own)]
-            tables["contact" if has_contact else "no contact"] = profiles(own, tried)
-    for title, some in (
-        ("default failed, or needs more than twice the best", [r for r in reached if _bad(r)]),
-        ("below what rounding leaves", [row for row in rows if row not in reached]),
-    ):
-        if some:
-            tables[title] = [_beside_best(row) for row in some]
+    """A profile of each solver, with and without contact, and rows in which the default is poor."""
+    tables, poor = dict[str, list[dict[str, Any]]](), list[dict[str, Any]]()
+    for title, solvers in SOLVERS.items():
+        if not (own := [row for row in rows if solvers[0] in row]):
+            continue
+        tried = [key for key in solvers if key in own[0]]
+        values = np.array([[np.inf if row[k] is None else row[k] for k in tried] for row in own])
+        values = np.maximum(values, 1.0)  # what no solver needs anything for is a tie
+        best = values.min(axis=1)
+        times = values / np.where(np.isinf(best), 1.0, best)[:, None]
+        tables[title] = [
+            {"solver": key, "solves": len(own), "failed": int(np.isinf(of).sum())}
+            | {f"τ = {tau:g}": float(np.mean(of <= tau)) for tau in TAUS}
+            for key, of in zip(tried, times.T, strict=True)
+        ]
+        for k in np.flatnonzero(times[:, 0] > NEAR):
+            named = {name: own[k][name] for name in ("scene", "rtol")}
+            named["best"] = None if np.isinf(best[k]) else int(best[k])
+            poor.append({**named, "default": own[k][tried[0]], "why": own[k][tried[0] + WHY]})
+    if poor:
+        tables["default failed, or needs more than twice the best"] = poor
     return tables
-
-
-def _beside_best(row: dict[str, Any]) -> dict[str, Any]:
-    """What the default solver and the best one need."""
-    (key,) = (solvers[0] for solvers in SOLVERS.values() if solvers[0] in row)
-    costs = [row[k] for k in row if k + ", failed" in row and row[k] is not None]
-    names = ("scene", "kind", "cell", "bodies", "friction", "rtol")
-    found = {"default": row[key], "best": min(costs, default=None)}
-    why = row[f"{key}, failed"].replace("|", "/")
-    return {**{name: row[name] for name in names}, **found, "why": why}
-
-
-def _bad(row: dict[str, Any]) -> bool:
-    found = _beside_best(row)
-    return found["default"] is None or found["default"] > NEAR * found["best"]
 
 
 def main(argv):

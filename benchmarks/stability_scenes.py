@@ -250,71 +250,62 @@ def to_rtol(cell: str, rtol: float, law: str = "") -> Scene:
     return replace(in_units(cell, 1.0, 1.0, law), options={"tfeti_rtol": rtol})
 
 
-def _ladders() -> list[Ladder]:
-    units = range(len(UNITS))
-    return [
-        Ladder("moduli", "soft on stiff", lambda c, v: two_bodies(c, v, 1.0), MODULI),
-        Ladder("moduli", "stiff on soft", lambda c, v: two_bodies(c, 1.0, v), MODULI),
-        Ladder("moduli", "loose stack", loose_stack, MODULI),
-        Ladder(
-            "moduli", "subdomains of a body", lambda c, v: jumping(pressed(c, at=-1e-3), v), MODULI
-        ),
-        Ladder(
-            "moduli", "subdomains of a pair", lambda c, v: jumping(two_bodies(c, 1, 1), v), MODULI
-        ),
-        Ladder("moduli", "cells", lambda c, v: pressed(c, at=-1e-3, jump=v), MODULI),
-        Ladder("nu", "P1", pressed, NU),
-        Ladder("nu", "P1, loose", lambda c, v: loose_stack(c, 1.0, v), NU),
-        Ladder("nu", "P2", lambda c, v: pressed(c, v, 2), NU),
-        Ladder("aspect", "layers at contact", layered, ASPECTS),
-        Ladder("aspect", "flat block", flat_block, ASPECTS),
-        Ladder("aspect", "slivers", slivers, ASPECTS, SIMPLICES),
-        Ladder("thin", "plate", thin, THIN),
-        Ladder("thin", "arch", lambda c, v: thin(c, v, 1.0), (10.0, 1e2, 1e3)),
-        Ladder("thin", "strips", strips, (*THIN, 1e4)),
-        Ladder("thin", "beam", beam, (*THIN, 1e4)),
-        Ladder("parts", "hang at corners", hanging, (0.0, 1.0)),
-        Ladder("parts", "random", scattered, tuple(map(float, range(6)))),
-        Ladder("parts", "hinge", hinge, (0.0, 1.0, 2.0)),
-        Ladder("rows", "two obstacles", two_obstacles, (0.0, -1.0, 1e-6, 1e-3)),
-        Ladder("rows", "pairs of a node", three_pairs, (1.0, 2.0, 3.0)),
-        Ladder("rows", "far obstacle", far_obstacle, FAR),
-        Ladder("rows", "grazing", grazing, (1.0, 1e-3, 1e-6, 1e-9, 0.0, -1e-6)),
-        Ladder("rows", "all or nothing", everywhere, (0.0, 1.0, 2.0)),
-        Ladder("units", "frictionless", lambda c, v: in_units(c, *UNITS[int(v)]), units),
-        Ladder("rtol", "frictionless", to_rtol, RTOL),
-        *_with_friction(),
-    ]
+def rubbing(of: Callable[[str, float], Scene], law: str, number: float) -> Any:
+    """Rungs of scenes with a law of friction."""
+    return lambda c, v: with_friction(of(c, v), law, number)
 
 
-def _with_friction() -> list[Ladder]:
-    def rubbing(of: Callable[[str, float], Scene], law: str, number: float) -> Any:
-        return lambda c, v: with_friction(of(c, v), law, number)
-
-    def coefficient(cell: str, value: float) -> Scene:
-        return with_friction(pressed(cell, push=-2e-3), "coulomb", value)
-
-    def soft(cell: str, value: float) -> Scene:
-        return two_bodies(cell, value, 1.0)
-
-    units = range(len(UNITS))
-    found = [
-        ("Tresca, moduli", rubbing(soft, "tresca", 1e-3), MODULI),
-        ("Coulomb, moduli", rubbing(soft, "coulomb", 0.3), MODULI),
-        ("Coulomb, coefficient", coefficient, (0.1, 1e-3, 0.5, 1.0, 10.0)),
-        ("Coulomb, nu", rubbing(pressed, "coulomb", 0.3), NU),
-        ("Coulomb, layers", rubbing(layered, "coulomb", 0.3), ASPECTS),
-        ("Coulomb, units", lambda c, v: in_units(c, *UNITS[int(v)], "coulomb"), units),
-        ("Coulomb, rtol", lambda c, v: to_rtol(c, v, "coulomb"), RTOL),
-    ]
-    return [Ladder("friction", *given, ("triangle", "hexahedron")) for given in found]
+def soft(cell: str, value: float) -> Scene:
+    return two_bodies(cell, value, 1.0)
 
 
-LADDERS = _ladders()
+IN_UNITS = range(len(UNITS))
+LADDERS = [
+    Ladder("moduli", "soft on stiff", soft, MODULI),
+    Ladder("moduli", "stiff on soft", lambda c, v: two_bodies(c, 1.0, v), MODULI),
+    Ladder("moduli", "loose stack", loose_stack, MODULI),
+    Ladder("moduli", "subdomains of a body", lambda c, v: jumping(pressed(c, at=-1e-3), v), MODULI),
+    Ladder("moduli", "subdomains of a pair", lambda c, v: jumping(two_bodies(c, 1, 1), v), MODULI),
+    Ladder("moduli", "cells", lambda c, v: pressed(c, at=-1e-3, jump=v), MODULI),
+    Ladder("nu", "P1", pressed, NU),
+    Ladder("nu", "P1, loose", lambda c, v: loose_stack(c, 1.0, v), NU),
+    Ladder("nu", "P2", lambda c, v: pressed(c, v, 2), NU),
+    Ladder("aspect", "layers at contact", layered, ASPECTS),
+    Ladder("aspect", "flat block", flat_block, ASPECTS),
+    Ladder("aspect", "slivers", slivers, ASPECTS, SIMPLICES),
+    Ladder("thin", "plate", thin, THIN),
+    Ladder("thin", "arch", lambda c, v: thin(c, v, 1.0), (10.0, 1e2, 1e3)),
+    Ladder("thin", "strips", strips, (*THIN, 1e4)),
+    Ladder("thin", "beam", beam, (*THIN, 1e4)),
+    Ladder("parts", "hang at corners", hanging, (0.0, 1.0)),
+    Ladder("parts", "random", scattered, tuple(map(float, range(6)))),
+    Ladder("parts", "hinge", hinge, (0.0, 1.0, 2.0)),
+    Ladder("rows", "two obstacles", two_obstacles, (0.0, -1.0, 1e-6, 1e-3)),
+    Ladder("rows", "pairs of a node", three_pairs, (1.0, 2.0, 3.0)),
+    Ladder("rows", "far obstacle", far_obstacle, FAR),
+    Ladder("rows", "grazing", grazing, (1.0, 1e-3, 1e-6, 1e-9, 0.0, -1e-6)),
+    Ladder("rows", "all or nothing", everywhere, (0.0, 1.0, 2.0)),
+    Ladder("units", "frictionless", lambda c, v: in_units(c, *UNITS[int(v)]), IN_UNITS),
+    Ladder("rtol", "frictionless", to_rtol, RTOL),
+]
+WITH_FRICTION = (
+    ("Tresca, moduli", rubbing(soft, "tresca", 1e-3), MODULI),
+    ("Coulomb, moduli", rubbing(soft, "coulomb", 0.3), MODULI),
+    (
+        "Coulomb, coefficient",
+        lambda c, v: with_friction(pressed(c, push=-2e-3), "coulomb", v),
+        (0.1, 1e-3, 0.5, 1.0, 10.0),
+    ),
+    ("Coulomb, nu", rubbing(pressed, "coulomb", 0.3), NU),
+    ("Coulomb, layers", rubbing(layered, "coulomb", 0.3), ASPECTS),
+    ("Coulomb, units", lambda c, v: in_units(c, *UNITS[int(v)], "coulomb"), IN_UNITS),
+    ("Coulomb, rtol", lambda c, v: to_rtol(c, v, "coulomb"), RTOL),
+)
+LADDERS += [Ladder("friction", *given, ("triangle", "hexahedron")) for given in WITH_FRICTION]
 
 
 def label(ladder: Ladder, value: float) -> str:
     """A value as it stands in a table."""
-    if ladder.name.endswith(("units", "frictionless")) and ladder.values == range(len(UNITS)):
+    if ladder.name.endswith(("units", "frictionless")) and ladder.values == IN_UNITS:
         return "{:g} m, {:g} Pa".format(*UNITS[int(value)])
     return f"{value:g}"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks.tools import column, command_line, curves, finish, picture, solve_seconds
+from benchmarks.tools import command_line, curves, finish, picture, solve_seconds
 from demos import run
 
 # subdomains: the talk's primal, dual, kernel dimension, multiplications, seconds (none are given
@@ -60,6 +60,8 @@ def row(reports, talk, subdomains, rtol):
     """A row of a table: ours beside the talk's."""
     primal, dual, kernel, multiplications, seconds = talk
     newton, smalse = reports["Newton"], reports["SMALSE"]
+    shares = {"sticking": newton.sticking, "sliding": newton.sliding}
+    rubbing = {name: count / newton.contact_rows for name, count in shares.items()}
     return {
         "subdomains": subdomains,
         "rtol": f"{rtol:.0e}",
@@ -76,21 +78,10 @@ def row(reports, talk, subdomains, rtol):
         "outer, Newton": newton.outer_iterations,
         "outer, SMALSE": smalse.outer_iterations,
         "power method": smalse.power_method_multiplications,
-        **(rubbing(newton) if newton.tangential_rows else {}),
-        **{f"seconds, {name}": seconds_of(report) for name, report in reports.items()},
+        **(rubbing if newton.tangential_rows else {}),
+        **{f"seconds, {name}": solve_seconds(vars(report)) for name, report in reports.items()},
         **({} if seconds is None else {"seconds, talk": seconds}),
     }
-
-
-def rubbing(report):
-    """Shares of the contact nodes that stick and that slide."""
-    touching = report.contact_rows
-    return {"sticking": report.sticking / touching, "sliding": report.sliding / touching}
-
-
-def seconds_of(report):
-    """Seconds of all but the mesh."""
-    return solve_seconds({"seconds": report.seconds})
 
 
 def table(demo, talk, sizes, arguments, options):
@@ -111,12 +102,9 @@ def draw(path, tables):
         for panel, (title, rows) in zip(axes, tables.items(), strict=True):
             last = [row for row in rows if row["rtol"] == rows[-1]["rtol"]]
             names = {"F, Newton": "Newton", "F, SMALSE": "SMALSE-M", "F, talk": "talk"}
-            lines = {
-                label: (column(last, "subdomains"), column(last, name))
-                for name, label in names.items()
-            }
-            labels = ("subdomains", "multiplications by F")
-            curves(panel, f"{title}, rtol {rows[-1]['rtol']}", labels, lines, log="x")
+            lines = {label: [{**row, "F": row[of]} for row in last] for of, label in names.items()}
+            labels, columns = ("subdomains", "multiplications by F"), ("subdomains", "F")
+            curves(panel, f"{title}, rtol {rows[-1]['rtol']}", labels, lines, columns, log="x")
 
 
 def main(argv):

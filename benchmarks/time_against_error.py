@@ -26,7 +26,6 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,6 @@ from benchmarks.pressures import Array, errors
 from benchmarks.tools import (
     FILE,
     Tables,
-    column,
     command_line,
     curves,
     finish,
@@ -62,7 +60,6 @@ FOLLOWED = {"half cylinder": "adaptive_2d", "half ball": "adaptive_3d"}
 SUBDOMAIN = {2: 2500, 3: 4000}
 # seconds up to which a solve is repeated, and how often
 SHORT, REPEATS = 3.0, 3
-LEVELS = (0.05, 0.02, 0.01)
 MEASURES = ("energy", "pressure")
 COMM = MPI.COMM_WORLD
 
@@ -209,14 +206,6 @@ def adapted(case: Case, goal: float) -> Solved:
     return Solved(problem, time.perf_counter() - begin - spent, spent, memory())
 
 
-def profile(scene: Scene, solution: tfeti.Solution) -> Array:
-    """The pressure at the scene's samples. Collective."""
-    data = solution.contact(0)
-    parts = COMM.allgather((scene.place(data.points), scene.force(data)))
-    points, pressure = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return scene.samples.at(points, pressure)
-
-
 def densities(sigma: Array) -> Array:
     """Eσ : C⁻¹σ of stresses, shape ``(n, 3, 3)``."""
     squares = (1 + NU) * np.einsum("nij,nij->n", sigma, sigma)
@@ -272,6 +261,9 @@ def solved_row(case: Case, size: float, reference: Path) -> dict[str, Any]:
         runs.append(last)
     best = min(runs, key=lambda run: run.seconds)
     problem, report = last.problem, last.problem.report
+    data = problem.solution.contact(0)
+    parts = COMM.allgather((scene.place(data.points), scene.force(data)))
+    points, pressure = (np.concatenate(part) for part in zip(*parts, strict=True))
     row = {
         "size": size,
         "unknowns": report.primal_dofs,
@@ -281,7 +273,7 @@ def solved_row(case: Case, size: float, reference: Path) -> dict[str, Any]:
         "F": int(report.in_all["F_multiplications"]),
         "energy": energy_error(reference, problem.solution) if timed else None,
         "estimate": problem.estimate().relative_discretisation,
-        "profile": profile(scene, problem.solution).tolist(),
+        "profile": scene.samples.at(points, pressure).tolist(),
     }
     if not timed:
         write_stresses(reference, problem.solution, scene.young)
@@ -318,23 +310,6 @@ def between(x: Sequence[float], y: Sequence[float], at: float) -> float:
     return float(np.exp(np.interp(np.log(at), np.log(x)[order], np.log(y)[order])))
 
 
-def seconds_at(rows: Sequence[dict[str, Any]], name: str, level: float) -> float | None:
-    """Seconds at an error, between two meshes on straight lines of logarithms."""
-    if rows[0][name] <= level:
-        return float(rows[0]["seconds"])
-    for ends in pairwise(rows):
-        if ends[1][name] <= level < ends[0][name]:
-            return between([e[name] for e in ends], [e["seconds"] for e in ends], level)
-    return None
-
-
-def summary(case: Case, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Seconds of a group of meshes at equal errors."""
-    levels = [(name, level) for name in MEASURES for level in LEVELS]
-    found = {f"{name} to {level:.0%}": seconds_at(rows, name, level) for name, level in levels}
-    return {"meshes": case.label, **found}
-
-
 def degrees(groups: dict[str, Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
     """Errors of degree 1 over those of degree 2 in the same time, by the names of groups."""
     table = []
@@ -357,31 +332,29 @@ def degrees(groups: dict[str, Sequence[dict[str, Any]]]) -> list[dict[str, Any]]
     return table
 
 
-def run_case(case: Case, reference: Path) -> dict[str, Any]:
-    """What a case gives, solved in processes of its own."""
-    words = [sys.executable, __file__, "--worker", json.dumps(asdict(case)), FILE, reference]
-    return json_of(words, case.ranks)
-
-
 def study(name: str, arguments: Any, folder: Path) -> Tables:
     """The tables of a scene; what its reference has goes into a folder."""
     (cases, finest), scene, reference = plans()[name], SCENES[name](), folder / "reference.npz"
     if arguments.quick:  # the first two groups, their two coarsest meshes
         cases = [replace(case, sizes=case.sizes[:2]) for case in cases[:2]]
         finest = replace(finest, sizes=cases[0].sizes[1:], rtol=1e-6)
-    best = run_case(finest, reference)["rows"][-1]
-    rows, groups, by_name = [], [], {}
+
+    def run(case: Case) -> list[dict[str, Any]]:  # in processes of its own
+        words = [sys.executable, __file__, "--worker", json.dumps(asdict(case)), FILE, reference]
+        found: list[dict[str, Any]] = json_of(words, case.ranks)["rows"]
+        return found
+
+    best = run(finest)[-1]
+    rows, by_name = [], {}
     for case in cases:
         if case.ranks in arguments.ranks:
-            found = run_case(replace(case, processor=arguments.processor), reference)
-            made = [compared(scene, one, best) for one in found["rows"]]
+            found = run(replace(case, processor=arguments.processor))
+            made = [compared(scene, one, best) for one in found]
             rows += [{"meshes": case.label, **row} for row in made]
             by_name[case.label] = made
-            groups.append(summary(case, made))
-            print(name, *groups[-1].values(), sep=" | ", flush=True)
-    tables = {name: rows, f"{name}, seconds to an error": groups}
+            print(name, case.label, flush=True)
     beside = degrees(by_name)
-    return {**tables, f"{name}, degrees at equal seconds": beside} if beside else tables
+    return {name: rows} | ({f"{name}, degrees at equal seconds": beside} if beside else {})
 
 
 def draw(path, tables):
@@ -393,8 +366,9 @@ def draw(path, tables):
         for k, (title, rows) in enumerate(scenes.items()):
             own = {of: [row for row in rows if row["meshes"] == of] for of in names}
             for panel, name in zip(axes[2 * k :], MEASURES, strict=False):
-                lines = {of: (column(g, "seconds"), column(g, name)) for of, g in own.items() if g}
-                curves(panel, title, ("seconds", f"relative error, {name}"), lines, names=names)
+                labels, columns = ("seconds", f"relative error, {name}"), ("seconds", name)
+                lines = {of: group for of, group in own.items() if group}
+                curves(panel, title, labels, lines, columns, names=names)
 
 
 def main(argv):

@@ -40,7 +40,8 @@ def command_line(
     """The parsed arguments, and the PETSc options that follow them.
 
     A benchmark's own arguments are ``given``: False makes a switch, a number is a default, and so
-    is a list of numbers; words are choices, of which some may be given, None if none are.
+    is a list of numbers, of whole ones if it is empty; words are choices, of which some may be
+    given, None if none are.
     """
     parser = argparse.ArgumentParser(
         description=description,
@@ -57,7 +58,8 @@ def command_line(
         elif several and isinstance(several[0], str):
             parser.add_argument(f"--{name}", nargs="+", choices=several)
         else:
-            kind, many = type((several or [default])[0]), {"nargs": "+"} if several else {}
+            kind = type((several or [default or 0])[0])  # of an empty list, too
+            many = {"nargs": "+"} if isinstance(default, list) else {}
             help = f"default {default}"
             parser.add_argument(f"--{name}", type=kind, default=default, help=help, **many)
     arguments, rest = parser.parse_known_args(argv)
@@ -133,12 +135,8 @@ def over_seeds(
 
     Collective. A row has a ``class``; what is not right is printed.
     """
-    parser = argparse.ArgumentParser(description=description.split("\n")[0])
-    parser.add_argument("--scenes", type=int, default=count, help="how many random scenes")
-    parser.add_argument("--seed", type=int, default=0, help="the first seed")
-    parser.add_argument("--only", nargs="*", type=int, help="seeds of scenes")
-    parser.add_argument("--output", type=Path, default=Path("results"))
-    arguments = parser.parse_args(argv)
+    # how many, the first seed, or all seeds
+    arguments, _ = command_line(description, argv, scenes=count, seed=0, only=[])
     rows = list[dict[str, Any]]()
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
@@ -228,12 +226,10 @@ def best_runs(
     """The fastest report of each run of a demo; the runs take turns, so that noise hits all."""
     reports: list[list[dict[str, Any]]] = [[] for _ in runs]
     for _ in range(1 if arguments.quick else arguments.repeats):
-        for run, found in zip(runs, reports, strict=True):
-            found.append(run_demo(*run))
-            name, words, ranks = run
-            print(
-                f"{name}, {ranks} ranks:", *words, f"{solve_seconds(found[-1]):.3g} s", flush=True
-            )
+        for (name, words, ranks), found in zip(runs, reports, strict=True):
+            found.append(run_demo(name, words, ranks))
+            seconds = f"{solve_seconds(found[-1]):.3g} s"
+            print(f"{name}, {ranks} ranks:", *words, seconds, flush=True)
     return [min(found, key=solve_seconds) for found in reports]
 
 
@@ -301,19 +297,20 @@ def stacked(axes: Any, title: str, rows: Sequence[Mapping[str, Any]], parts: Seq
     axes.set_xlim(0.0, 1.3 * max(left))  # room for the legend
     axes.set_xlabel("seconds")
     axes.set_title(title, fontsize="medium")
-    if len(parts) > 1:
-        axes.legend(fontsize="small")
+    axes.legend(fontsize="small")
 
 
 def curves(
     axes: Any,
     title: str,
     labels: tuple[str, str],
-    lines: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    tables: Mapping[str, Sequence[Mapping[str, Any]]],
+    columns: tuple[str, str],
     log: str = "xy",
     names: Sequence[str] = (),
 ) -> None:
-    """A curve for each name, the axes of ``log`` logarithmic; one of ``names`` has its colour."""
+    """A curve of two columns for each name, logarithmic axes in ``log``; ``names`` have colours."""
+    lines = {name: [[row[c] for row in rows] for c in columns] for name, rows in tables.items()}
     for name, (x, y) in lines.items():
         axes.plot(x, y, marker="o", label=name, color=f"C{names.index(name)}" if names else None)
     if "x" in log:
@@ -345,8 +342,3 @@ def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
     axis.set_major_locator(FixedLocator(ticks) if short else few)
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
-def column(rows: Sequence[Mapping[str, Any]], name: str) -> list[float]:
-    """A column of a table."""
-    return [row[name] for row in rows]

@@ -33,8 +33,6 @@ from meshes.tools import graded_size, started_model, torn
 COMM = MPI.COMM_WORLD
 # sizes of elements, over those of the quick run
 FINE = 0.4
-
-
 Row = dict[str, Any]
 
 
@@ -146,12 +144,6 @@ def pin_in_sheet(size: float) -> Any:
     return model
 
 
-def contact_force(problem: tfeti.ContactProblem) -> float:
-    """Resultant of the first contact along the last axis. Collective."""
-    data = problem.solution.contact()
-    return abs(COMM.allreduce(float((data.force @ data.normal)[-1])))
-
-
 def point_contact(
     case: str,
     mesh: tuple[float, float],
@@ -176,7 +168,8 @@ def point_contact(
     problem = scene.problem([tfeti.Obstacle("arc", partner[0], reach=4 * down)])
     problem.solve()
     data = problem.solution.contact()
-    hertz = PointContact.from_load(contact_force(problem), partner[1], E / (1 - nu**2))
+    force = abs(data.resultant.force[1])
+    hertz = PointContact.from_load(force, partner[1], E / (1 - nu**2))
     found = fit(COMM, data.points[:, 0], data.pressure, hertz.peak)
     own, names = (hertz.half_width, hertz.peak), ("a", "p₀")
     rows = [
@@ -297,7 +290,8 @@ def rigid_sphere(scale: float) -> Iterator[Row]:
     rigid = tfeti.Sphere((0.0, -R), R)
     rows, problem = point_contact(case, mesh, ball, (rigid, R / 2), (0.1, 9.55e5, None))
     yield from rows
-    yield figure(case, "F, published", 2.0e4, contact_force(problem), None, problem)
+    force = abs(problem.solution.contact().resultant.force[1])
+    yield figure(case, "F, published", 2.0e4, force, None, problem)
 
 
 def press_fit(scale: float) -> Iterator[Row]:
@@ -391,7 +385,7 @@ def plastic_indentation(scale: float) -> Iterator[Row]:
         total += work(problem)
         if depth in figures:
             slip, other, allowed = figures[depth]
-            force = contact_force(problem) / (2 * pi)
+            force = abs(problem.solution.contact().resultant.force[1]) / (2 * pi)
             for whose, published, limit in (
                 ("slip lines", slip, allowed),
                 ("Code_Aster", other, None),
@@ -409,19 +403,7 @@ def thick_cylinder(scale: float) -> Iterator[Row]:
     out = scene.hold("left", 0)
     for side in ("bottom", "top"):
         scene.hold(side, 1)
-    u = fem.Function(scene.V)
-    steel = tfeti.J2Plasticity(scene.elastic, u, yield_stress=strength)
-    problem = tfeti.NonlinearContactProblem(
-        steel.residual(scene.v),
-        u,
-        scene.bcs,
-        [],
-        d,
-        J=steel.tangent(scene.u, scene.v),
-        state=steel.state,
-        update=steel.update,
-        petsc_options={"rtol": 1e-8},
-    )
+    steel, problem = scene.plastic([], 1e-8, yield_stress=strength)
     inner, total = scene.dofs("left", 0), 0
     residual = fem.form(steel.residual(scene.v))
     for value in np.linspace(0.001, 0.02, 20):

@@ -23,7 +23,7 @@ SIZES = {"talk_hertz_2d": ["--subdomains", "32"]}
 BENCHMARKS = {
     "performance_price": ["linear_price"],
     "performance_talk": ["talk_tables"],
-    "performance_weak": ["scaling", "weak"],
+    "performance_weak": ["scaling"],
     "time_against_error": ["time_against_error"],
 }
 

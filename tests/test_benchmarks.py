@@ -24,15 +24,14 @@ from benchmarks import (
 )
 
 
-def name_of(benchmark, arguments):
+def name_of(benchmark):
     """Name of its tables."""
-    name = benchmark.__name__.split(".")[-1]
-    return f"{name}_{arguments[0]}" if benchmark is scaling else name
+    return benchmark.__name__.split(".")[-1]
 
 
 def with_arguments(benchmark, *arguments, slow=False):
-    name = name_of(benchmark, arguments)
-    return pytest.param(benchmark, arguments, id=name, marks=[pytest.mark.slow] if slow else [])
+    marks = [pytest.mark.slow] if slow else []
+    return pytest.param(benchmark, arguments, id=name_of(benchmark), marks=marks)
 
 
 START_MPIRUN = (ranks, solver_profiles, scaling, time_against_error)
@@ -43,11 +42,10 @@ RUNS = [
     with_arguments(linear_price, "--scenes", "cube_3d", "--processor"),
     with_arguments(ranks),
     with_arguments(stability, "--groups", "nu"),
-    with_arguments(scaling, "strong", "--ranks", "2"),
+    with_arguments(scaling),
     with_arguments(talk_tables, "--rtol", "1e-4"),
     with_arguments(solver_profiles, "--steps", "100", slow=True),
     with_arguments(time_against_error, "--ranks", "1", "--scenes", "half cylinder", slow=True),
-    with_arguments(scaling, "weak", slow=True),
 ]
 
 
@@ -60,7 +58,7 @@ def test_a_quick_run_writes_the_tables_that_it_returns(
     monkeypatch.setattr(time, "perf_counter", time.perf_counter)  # --processor changes it
     tables = benchmark.main(["--quick", "--output", str(shared_tmp), *arguments])
     comm.barrier()
-    name = name_of(benchmark, arguments)
+    name = name_of(benchmark)
     assert (shared_tmp / f"{name}.md").read_text().startswith("## ")
     assert json.loads((shared_tmp / f"{name}.json").read_text()).keys() == tables.keys()
     if benchmark in DRAWN:
@@ -116,7 +114,7 @@ def test_pressures_are_compared_as_functions():
     """Linear between points in any order: Hertz's own, on points that are fine enough."""
     rng = np.random.default_rng(0)
     for samples, power in ((pressures.Samples.line(2.0), 1), (pressures.Samples.disc(2.0), 2)):
-        exact = samples.exact(lambda r: np.sqrt(np.maximum(1.0 - (r / 2.0) ** 2, 0.0)))
+        exact = np.sqrt(np.maximum(1.0 - (samples.distance / 2.0) ** 2, 0.0))
         points = rng.uniform(-3.0, 3.0, (20_000, power))
         p = np.sqrt(np.maximum(1.0 - (np.linalg.norm(points, axis=1) / 2.0) ** 2, 0.0))
         found = pressures.errors(samples, samples.at(points, 1.01 * p), exact)

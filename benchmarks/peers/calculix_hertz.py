@@ -66,14 +66,6 @@ CDIS, CSTR
 """
 
 
-def solved(job):
-    """Run CalculiX on a deck; what it says."""
-    done = subprocess.run(["ccx", job.name], cwd=job.parent, capture_output=True, text=True)
-    if "Job finished" not in done.stdout:
-        raise RuntimeError(done.stdout[-2000:] + done.stderr[-500:])
-    return done.stdout
-
-
 def on_contact(data, file):
     """Places of the contact surface and pressures there, the mean of both layers' nodes."""
     places, pressure, block = {}, {}, None
@@ -98,7 +90,10 @@ def prepare(data):
     job.with_suffix(".inp").write_text(deck(data))
 
     def once():
-        steps = solved(job).count(" iteration ")
+        done = subprocess.run(["ccx", job.name], cwd=job.parent, capture_output=True, text=True)
+        if "Job finished" not in done.stdout:
+            raise RuntimeError(done.stdout[-2000:] + done.stderr[-500:])
+        steps = done.stdout.count(" iteration ")
         return *on_contact(data, job.with_suffix(".frd")), data["points"].size, steps
 
     version = subprocess.run(["ccx", "-v"], capture_output=True, text=True).stdout.split()[-1]

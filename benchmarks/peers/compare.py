@@ -21,6 +21,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +34,6 @@ SHORT, REPEATS = 3.0, 5
 NAME, MESH = "tfeti_dolfinx", "mesh"  # of programs of ours
 SCENES = ("half_cylinder", "pressed_disc", "indentation")
 LEVELS = {"pressure": (0.05, 0.02, 0.01, 0.005, 0.002), "force": (0.01, 0.003, 0.001)}
-
-
-def told(words):
-    """Run a command; what went wrong, or nothing."""
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, cwd=ROOT)
-    except subprocess.TimeoutExpired:
-        return f"stopped after {LIMIT} s"
-    return "" if done.returncode == 0 else (done.stdout + done.stderr)[-500:]
 
 
 def command(scene, program, case, file):
@@ -123,10 +115,20 @@ class ByForce:
         return rows, {name: [lines[name]] for name in self.programs if name in lines}
 
 
+def seconds_at(rows, name, level):
+    """Seconds at an error, between two meshes on straight lines of logarithms."""
+    from benchmarks.time_against_error import between
+
+    if rows[0][name] <= level:
+        return rows[0]["seconds"]
+    for ends in pairwise(rows):
+        if ends[1][name] <= level < ends[0][name]:
+            return between([e[name] for e in ends], [e["seconds"] for e in ends], level)
+    return None
+
+
 def tables_of(title, rows, lines, measure):
     """The rows, and seconds to equal errors, each program at its better line of meshes."""
-    from benchmarks.time_against_error import seconds_at
-
     table = []
     for program, own in lines.items():
         row = {"program": program}
@@ -148,12 +150,10 @@ def write(scene, folder, commit=None):
         lines = {}
         # an error of 1 is no answer: that point is left to the table
         for row in (row for row in tables[title] if row["pressure"] < 1.0):
-            x, y = lines.setdefault(f"{row['program']}, order {row['order']}", ([], []))
-            x.append(row["seconds"])
-            y.append(row["pressure"])
+            lines.setdefault(f"{row['program']}, order {row['order']}", []).append(row)
         with picture(path, 1, 4.6) as (panel,):
             labels = "seconds of the processor", "relative error of the pressure inside 0.9 a"
-            curves(panel, title, labels, lines)
+            curves(panel, title, labels, lines, ("seconds", "pressure"))
 
     given = argparse.Namespace(output=folder.parent, document=commit)
     return finish(given, name, tables, draw if measure == "pressure" else None)
@@ -180,7 +180,11 @@ def main():
     # where forms of many programs lie, to find one takes longer
     os.environ["TFETI_JIT_CACHE"] = str(folder / "forms")
     for label, words, file in scene.commands(folder, arguments.quick):
-        said = told(words)
+        try:
+            done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, cwd=ROOT)
+            said = (done.stdout + done.stderr)[-500:] if done.returncode else ""
+        except subprocess.TimeoutExpired:
+            said = f"stopped after {LIMIT} s"
         print(label, said or "done", flush=True)
         if said:
             if file is None:

@@ -15,33 +15,26 @@ RESIDUAL = 1e-6  # over the load
 TO_ROWS = {1: [0, 1, 2], 2: [0, 3, 1, 5, 4, 2]}
 
 
-def body_of(data):
-    """The body, with its regions."""
+def prepare(data, r=10.0):
+    """The program, and a solve: places, pressures there, unknowns and steps."""
     order = int(data["order"])
     places = data["points"][data["cells"][:, TO_ROWS[order]]]
     body = Body(places, data["contact cells"], order, order, 2 if order == 1 else 5)
     body.mark(TOP, data["top cells"])
-    return body
-
-
-def solve(data, body, r):
-    """Places, pressures there, unknowns and steps."""
     E, nu, a, R = (float(data[name]) for name in ("E", "nu", "a", "R"))
     numbers = {"lambda": E * nu / (1 + nu) / (1 - 2 * nu), "mu": E / 2 / (1 + nu)}
-    x, _, across = body.begin(**numbers, r=r * E / a)
-    model = body.model
-    model.add_isotropic_linearized_elasticity_brick(body.im, "u", "lambda", "mu")
-    model.add_initialized_data("traction", [0.0, -float(data["traction"])])
-    model.add_source_term_brick(body.im, "u", "traction", TOP)
-    # the axis does not move to the side: no force is needed for that
-    body.hold(np.flatnonzero((np.abs(x) < 1e-9 * np.abs(x).max()) & ~across))
-    _, places = body.touch(lambda x, y: y, 1)
-    model.set_variable("u", np.where(across, -(a**2) / (2 * R), 0.0))
-    steps = body.solved(RESIDUAL * float(data["load"]))
-    return places, -model.variable("pressure"), len(x) + len(places), steps
 
+    def solve():
+        x, _, across = body.begin(**numbers, r=r * E / a)
+        model = body.model
+        model.add_isotropic_linearized_elasticity_brick(body.im, "u", "lambda", "mu")
+        model.add_initialized_data("traction", [0.0, -float(data["traction"])])
+        model.add_source_term_brick(body.im, "u", "traction", TOP)
+        # the axis does not move to the side: no force is needed for that
+        body.hold(np.flatnonzero((np.abs(x) < 1e-9 * np.abs(x).max()) & ~across))
+        _, places = body.touch(lambda x, y: y, 1)
+        model.set_variable("u", np.where(across, -(a**2) / (2 * R), 0.0))
+        steps = body.solved(RESIDUAL * float(data["load"]))
+        return places, -model.variable("pressure"), len(x) + len(places), steps
 
-def prepare(data, r=10.0):
-    """The program, and a solve."""
-    body = body_of(data)
-    return f"GetFEM {gf.getfem_env('version')}", lambda: solve(data, body, r)
+    return f"GetFEM {gf.getfem_env('version')}", solve

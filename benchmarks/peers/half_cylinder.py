@@ -10,7 +10,7 @@ benchmarks/time_against_error.py.
 import importlib
 import json
 
-from compare import MESH, NAME, OURS, ROOT, command
+from compare import MESH, NAME, OURS, ROOT, command, facets_on
 
 SIZES = {1: (6, 12, 24, 48), 2: (3, 6, 12, 24)}  # elements along a, by the order of the mesh
 PEERS = {"GetFEM": (1, 2), "CalculiX": (1, 2), "Kratos": (1,)}  # orders of meshes
@@ -43,21 +43,13 @@ def mesh(size, order, file):
     number, place = np.zeros((2, int(tags.max()) + 1), dtype=np.int64)
     number[used], place[tags.astype(np.int64)] = np.arange(len(used)), np.arange(len(tags))
     cells, points = number[cells], coordinates.reshape(-1, 3)[place[used], :2]
-    p, q, r = points[cells[:, :3]].transpose(1, 2, 0)
-    turned = (q - p)[0] * (r - p)[1] < (q - p)[1] * (r - p)[0]
-    mirrored = [1, 0, 2] if order == 1 else [1, 0, 2, 3, 5, 4]
-    cells = np.where(turned[:, None], cells[:, mirrored], cells)
     found = {"points": points, "cells": cells, "order": order, "axis": number[group(1, "axis")]}
-    # edges by the corners opposite of them, as they lie in their cells
-    edges = np.stack([cells[:, [1, 2]], cells[:, [2, 0]], cells[:, [0, 1]]], axis=1)
-    keys = np.sort(edges, axis=2) @ [len(points), 1]
-    order_of_keys = np.argsort(keys, axis=None)
+    # ends of the edge opposite of a corner, as it lies in its cell, and the node between them
+    along = np.array([(1, 2, 4), (2, 0, 5), (0, 1, 3)])[:, : order + 1]
     for surface in ("contact", "top"):
-        facets = number[group(1, surface)]
-        key = np.sort(facets[:, :2], axis=1) @ [len(points), 1]
-        at = order_of_keys[np.searchsorted(keys.ravel(), key, sorter=order_of_keys)]
-        found[f"{surface} cells"] = np.stack(np.divmod(at, 3), axis=1)
-        found[surface] = np.hstack((edges.reshape(-1, 2)[at], facets[:, 2:]))
+        on = np.isin(cells[:, :3], number[group(1, surface)])
+        found[f"{surface} cells"] = facets = facets_on(on)
+        found[surface] = np.take_along_axis(cells[facets[:, 0]], along[facets[:, 1]], axis=1)
     ends = points[found["top"][:, :2]]
     traction = LINE.load / np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum()
     data = {"load": LINE.load, "a": LINE.half_width, "R": R, "E": 1.0, "nu": NU}

@@ -28,18 +28,12 @@ def block(n):
 
 def ours(points, cells):
     """A solve that returns force, unknowns and steps of Newton's method; in ./run."""
-    import basix.ufl
     import numpy as np
-    import ufl
-    from dolfinx import fem
-    from dolfinx import mesh as dmesh
-    from mpi4py import MPI
 
     import tfeti_dolfinx as tfeti
+    from benchmarks.elastic import Elastic, triangles
 
-    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
-    body = dmesh.create_mesh(MPI.COMM_WORLD, cells=cells.astype(np.int64), x=points, e=element)
-    at = {"top": (1, 0.0), "bottom": (1, -SIZE), "axis": (0, 0.0)}
+    body, at = triangles(points, cells), {"top": (1, 0.0), "bottom": (1, -SIZE), "axis": (0, 0.0)}
     sides = {name: lambda x, k=k, c=c: np.isclose(x[k], c) for name, (k, c) in at.items()}
     shape = tfeti.SignedDistance(
         lambda x: x[0] ** 2 / (2 * R) - x[1],
@@ -49,22 +43,15 @@ def ours(points, cells):
 
     def solve(steps=STEPS):
         d = tfeti.decompose(body, max(len(cells) // 600, 1), surfaces=sides)
-        V = fem.functionspace(d.mesh, ("Lagrange", 2, (2,)))
-        u, v, w = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
-        bcs = []
+        scene = Elastic(d, E, NU, "plane_strain", 2)
         for name, k in (("axis", 0), ("bottom", 0), ("bottom", 1)):
-            held = fem.locate_dofs_topological(V.sub(k), 1, d.facets(name))
-            bcs.append(fem.dirichletbc(0.0, held, V.sub(k)))
-        elastic = tfeti.Elasticity(d, E=E, nu=NU, model="plane_strain")
-        steel = tfeti.J2Plasticity(elastic, u, yield_stress=STRENGTH, hardening=HARDENING)
-        given = {"J": steel.tangent(w, v), "state": steel.state, "update": steel.update}
-        given["petsc_options"] = {"tfeti_rtol": 1e-4}
+            scene.hold(name, k)
         wheel = tfeti.Obstacle("top", shape, displacement=lambda depth: (0.0, -depth))
-        problem = tfeti.NonlinearContactProblem(steel.residual(v), u, bcs, [wheel], d, **given)
+        _, problem = scene.plastic([wheel], 1e-4, yield_stress=STRENGTH, hardening=HARDENING)
         records = tfeti.LoadSteps(problem, lambda problem, depth: None, depths[:steps]).run()
         force = problem.solution.reaction("bottom").force[1]
         did = sum(record.figures["newton_steps"] for record in records)
-        return abs(float(force)), V.dofmap.index_map.size_global * 2, did
+        return abs(float(force)), scene.V.dofmap.index_map.size_global * 2, did
 
     solve(1)  # compiles forms
     return solve

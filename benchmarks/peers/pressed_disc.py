@@ -31,17 +31,13 @@ def quarter_disc(n):
 
 def ours(points, cells):
     """A solve that returns force, unknowns and steps of Newton's method; in ./run."""
-    import basix.ufl
     import numpy as np
-    import ufl
     from dolfinx import fem
-    from dolfinx import mesh as dmesh
-    from mpi4py import MPI
 
     import tfeti_dolfinx as tfeti
+    from benchmarks.elastic import Elastic, triangles
 
-    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
-    disc = dmesh.create_mesh(MPI.COMM_WORLD, cells=cells.astype(np.int64), x=points, e=element)
+    disc = triangles(points, cells)
     sides = {
         "arc": lambda x: np.isclose(np.hypot(x[0], x[1] - 1.0), 1.0),
         "top": lambda x: np.isclose(x[1], 1.0),
@@ -50,23 +46,23 @@ def ours(points, cells):
 
     def solve():
         d = tfeti.decompose(disc, max(len(cells) // 600, 1), surfaces=sides)
-        V = fem.functionspace(d.mesh, ("Lagrange", 2, (2,)))
-        u, v, down = fem.Function(V), ufl.TestFunction(V), fem.Constant(d.mesh, (0.0, 0.0))
-        top = fem.locate_dofs_topological(V, 1, d.facets("top"))
-        axis = fem.locate_dofs_topological(V.sub(0), 1, d.facets("axis"))
-        bcs = [fem.dirichletbc(down, top, V), fem.dirichletbc(0.0, axis, V.sub(0))]
-        law = tfeti.NeoHooke(tfeti.Elasticity(d, E=E, nu=NU, model="plane_strain"), u, degree=2)
+        scene = Elastic(d, E, NU, "plane_strain", 2)
+        scene.hold("top", 0)
+        down, u = scene.hold("top", 1), fem.Function(scene.V)
+        scene.hold("axis", 0)
+        law = tfeti.NeoHooke(scene.elastic, u, degree=2)
         plane = tfeti.Obstacle("arc", tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0)))
         given = {"finite": True, "update": law.update}
-        problem = tfeti.NonlinearContactProblem(law.residual(v), u, bcs, [plane], d, **given)
+        residual = law.residual(scene.v)
+        problem = tfeti.NonlinearContactProblem(residual, u, scene.bcs, [plane], d, **given)
         steps = 0
         for depth in DEPTHS:
-            down.value[1] = -depth
+            down.value = -depth
             problem.solve()
             problem.accept()
             steps += problem.report.newton_steps
         force = problem.solution.reaction("top").force[1]
-        return abs(float(force)), V.dofmap.index_map.size_global * 2, steps
+        return abs(float(force)), scene.V.dofmap.index_map.size_global * 2, steps
 
     solve()  # compiles forms
     return solve

@@ -23,11 +23,8 @@ from benchmarks.tools import over_seeds, wrong
 
 def main(argv: list[str]) -> list[dict[str, Any]]:
     """Run scenes; returns their rows, complete on rank 0. Collective."""
-
-    def solve(seed: int) -> dict[str, Any]:
-        return run_scene(random_scene(seed), MPI.COMM_WORLD)
-
-    return over_seeds(__doc__, argv, 100, "stress", solve)
+    comm = MPI.COMM_WORLD
+    return over_seeds(__doc__, argv, 100, "stress", lambda k: run_scene(random_scene(k), comm))
 
 
 if __name__ == "__main__":

@@ -142,14 +142,6 @@ def elastic_residual(scene: Scene, u: fem.Function) -> Any:
 # --- The package's problem ----------------------------------------------------------------------
 
 
-@dataclass
-class Run:
-    """A problem of the package, and how its scene moves."""
-
-    problem: Any
-    move: Callable[[np.ndarray], None]
-
-
 def placed(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """A point of the obstacle and its normal there: below what is pressed on it, or a tool above.
 
@@ -168,8 +160,10 @@ def shape_of(scene: Scene) -> Any:
     return tfeti.Sphere(foot - scene.radius * normal, scene.radius)
 
 
-def posed(scene: Scene, mesh: dmesh.Mesh, tags: Any, surfaces: dict[str, int]) -> Run:
-    """Give a scene to the package."""
+def posed(
+    scene: Scene, mesh: dmesh.Mesh, tags: Any, surfaces: dict[str, int]
+) -> tuple[Any, Callable[[np.ndarray], None]]:
+    """Give a scene to the package; the problem, and how the scene moves."""
     gdim = scene.gdim
     decomposition = tfeti.decompose(mesh, scene.subdomains, facet_tags=tags, surfaces=surfaces)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
@@ -198,7 +192,7 @@ def posed(scene: Scene, mesh: dmesh.Mesh, tags: Any, surfaces: dict[str, int]) -
 
     contacts = [contact_of(scene, way, force)]
     problem = tfeti.NonlinearContactProblem(residual, u, bcs, contacts, decomposition, **given)
-    return Run(problem, move)
+    return problem, move
 
 
 def contact_of(scene: Scene, way: fem.Constant, force: fem.Constant) -> Any:
@@ -333,21 +327,19 @@ def run_scene(scene: Scene) -> dict[str, Any]:
         row["class"] = limited(SECONDS, lambda: _solved(scene, row))
     except TimeoutError:
         row["class"] = "SLOW"
-    except tfeti.TfetiError as error:
-        row |= {"class": "not solved", "error": f"{type(error).__name__}: {error}"}
     except Exception as error:
-        row |= {"class": "CRASH", "error": f"{type(error).__name__}: {error}"}
+        kind = "not solved" if isinstance(error, tfeti.TfetiError) else "CRASH"
+        row |= {"class": kind, "error": f"{type(error).__name__}: {error}"}
     return {**row, "seconds": time.perf_counter() - begin}
 
 
 def _solved(scene: Scene, row: dict[str, Any]) -> str:
     made = blocks(scene)
-    run, check = posed(scene, *made), Check(scene, *made)
-    problem, missed = run.problem, list[str]()
+    (problem, move), check, missed = posed(scene, *made), Check(scene, *made), list[str]()
     row["F"] = row["newton"] = 0
 
     def advance(start: np.ndarray, end: np.ndarray, halvings: int) -> None:
-        run.move(end)
+        move(end)
         try:
             problem.solve()
         except tfeti.ConvergenceError:

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress import meshes
-from benchmarks.stress.scene import Scene, Wall, side_name, wall_distance
+from benchmarks.stress.scene import Scene, side_name, wall_distance
 
 
 @dataclass
@@ -30,21 +30,6 @@ class Outcome:
     seconds: float = 0.0
 
 
-class WallShape:
-    """A wall as a shape of the package."""
-
-    def __init__(self, wall: Wall) -> None:
-        self.wall = wall
-
-    def distance(self, x: np.ndarray) -> np.ndarray:
-        """Signed distance, shape ``(n,)``."""
-        return wall_distance(self.wall, x)[0]
-
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Gradient, shape ``(3, n)``."""
-        return wall_distance(self.wall, x)[1]
-
-
 def contacts_of(scene: Scene) -> list[Any]:
     """Obstacles and pairs in the package's words."""
     laws = {"tresca": tfeti.Tresca, "coulomb": tfeti.Coulomb}
@@ -52,10 +37,11 @@ def contacts_of(scene: Scene) -> list[Any]:
     def law(friction: tuple[str, float] | None) -> Any:
         return friction and laws[friction[0]](friction[1])
 
-    walls = [
-        tfeti.Obstacle(side_name(w.side), WallShape(w), friction=law(w.friction))
-        for w in scene.walls
-    ]
+    walls: list[Any] = []
+    for w in scene.walls:
+        distances = (lambda x, w=w, k=k: wall_distance(w, x)[k] for k in (0, 1))
+        shape = tfeti.SignedDistance(*distances)
+        walls.append(tfeti.Obstacle(side_name(w.side), shape, friction=law(w.friction)))
     for p in scene.pairs:
         own, other = side_name(p.secondary), side_name(p.primary)
         walls.append(tfeti.Contact(own, other, secondary=own, friction=law(p.friction)))
@@ -98,7 +84,14 @@ def solve_scene(scene: Scene, g: meshes.Grid, comm: MPI.Intracomm) -> Outcome:
     except Exception as caught:
         error = f"{type(caught).__name__}: {caught}"
     if problem is not None:
-        outcome.report = _reported(problem)
+        report = problem.report
+        outcome.report = {
+            "reason": report.converged_reason,
+            "warnings": report.warnings + report.notes,
+            "F": report.F_multiplications,
+            "S": report.preconditioner_multiplications,
+            "estimate": report.residuals.get("displacement_error", 0.0),
+        }
         problem.destroy()
     outcome.seconds = time.perf_counter() - start
     errors = comm.allgather(error)
@@ -148,15 +141,3 @@ def _collect(scene: Scene, g: meshes.Grid, problem: tfeti.ContactProblem, outcom
     gathered = [comm.gather(part) for part in (x, body, problem.u.x.array.reshape(-1, gdim))]
     if comm.rank == 0:
         outcome.x, outcome.body, outcome.u = (np.concatenate(part) for part in gathered)
-
-
-def _reported(problem: tfeti.ContactProblem) -> dict[str, Any]:
-    """Some of the report."""
-    report = problem.report
-    return {
-        "reason": report.converged_reason,
-        "warnings": report.warnings + report.notes,
-        "F": report.F_multiplications,
-        "S": report.preconditioner_multiplications,
-        "estimate": report.residuals.get("displacement_error", 0.0),
-    }
