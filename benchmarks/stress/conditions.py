@@ -199,7 +199,8 @@ def _points(
     moved, rest = np.eye(len(s.nodes)), [k for k in range(len(s.nodes)) if k not in spots]
     for k in spots:
         # of a rectangle corners along an edge, of a triangle all
-        along = [j for j in rest if len(s.x) < 4 or np.any(s.x[j] == s.x[k])]
+        near = abs(s.x - s.x[k]).min(axis=1) <= ROUNDING * (s.high - s.low).max()
+        along = [j for j in rest if len(s.x) < 4 or near[j]]
         moved[k, k], moved[along or rest, k] = 0.0, 1.0 / len(along or rest)
     return spots, moved
 

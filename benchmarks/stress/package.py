@@ -130,9 +130,11 @@ def _collect(scene: Scene, g: meshes.Grid, problem: tfeti.ContactProblem, outcom
     forces = np.zeros((len(scene.bodies), gdim))
     partners = [(w.side[0], None) for w in scene.walls]
     partners += [(p.secondary[0], p.primary[0]) for p in scene.pairs]
+    gluing, force = problem.solution.gluing, problem.solution.force.copy()
+    force[gluing.closed()] = 0.0  # held nodes are given what nothing says (docs/howto/reactions.md)
     for k, (own, other) in enumerate(partners):
-        data = problem.solution.contact(k)
-        total = data.force @ data.normal.reshape(len(data.force), gdim)
+        data, of = problem.solution.contact(k), gluing.records.contact == k
+        total = force[of] @ gluing.records.normal[of]
         total -= data.area @ data.tangential_traction.reshape(len(data.force), gdim)
         forces[own] -= total
         if other is not None:
