@@ -410,12 +410,12 @@ def test_a_tool_that_no_nonlinear_body_balances_is_named(finite):
         nonlinear(finite, tool).solve()
 
 
-def test_a_ball_that_rolls_off_a_block_in_a_step_asks_for_smaller_ones():
-    law = {"displacement": lambda t: (0.6 * t, 0.0), "force": (0.0, -0.2), "free": ("y",)}
-    problem = nonlinear(True, tfeti.RigidBody(ball(2, 0.5), **law))
-    accepted(problem)
+@pytest.mark.parametrize("way", [0.55, 0.6])
+def test_a_ball_that_rolls_off_a_block_in_a_step_asks_for_smaller_ones(way):
+    law = {"displacement": lambda t: (way * t, 0.0), "force": (0.0, -0.2), "free": ("y",)}
+    accepted(problem := nonlinear(True, tfeti.RigidBody(ball(2, 0.5), **law)))
     problem.time = 1.0
-    with pytest.raises(tfeti.ConvergenceError, match="faces away.*; or smaller load steps"):
+    with pytest.raises(tfeti.ConvergenceError, match="(away|only contact).*; or smaller load"):
         problem.solve()
 
 

@@ -17,7 +17,13 @@ from tfeti_dolfinx.common.validation import checked_callable, checked_flag, chec
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
-from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.errors import (
+    ConvergenceError,
+    InputError,
+    NoSolutionError,
+    TfetiError,
+    raised_on_all_ranks,
+)
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
@@ -72,7 +78,8 @@ class NonlinearContactProblem(ContactProblem):
         others: As for ``ContactProblem``; ``rtol`` is that of the displacement.
 
     ``solve`` goes on from the last displacement. Where Newton's method or a linearised problem does
-    not converge it raises a ConvergenceError, and ``u`` is where the load step began.
+    not converge, or that of an iterate has no solution, it raises a ConvergenceError, and ``u`` is
+    where the load step began.
 
     Raises:
         InputError: Something given does not fit; the message names it.
@@ -189,7 +196,7 @@ class NonlinearContactProblem(ContactProblem):
                 rtol = min(rtol, tol.last * exact)
             try:
                 self._solve_linearised(rtol, warns=step == 0 or rtol <= exact)
-            except InputError as error:  # that of an iterate, not of what was given
+            except (InputError, NoSolutionError) as error:  # of an iterate, not of what was given
                 if step == 0:
                     raise
                 raise ConvergenceError(
