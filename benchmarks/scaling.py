@@ -16,11 +16,6 @@ from benchmarks.tools import best_runs, command_line, curves, finish, picture, s
 # numbers of subdomains, all but the last without --large; cells along an edge of one
 SCENES = {"cube_3d": ((8, 64, 512), 10), "talk_hertz_2d": ((8, 32, 128, 512), 50)}
 QUICK = {"cube_3d": ((8, 27), 3), "talk_hertz_2d": ((8,), 12)}
-# columns of the picture, what its axis says, and which axes are logarithmic
-PANELS = (
-    ("subdomains", "F", "multiplications by F", "x"),
-    ("unknowns", "processor", "processor seconds of all ranks", "xy"),
-)
 
 
 def table(name, counts, cells, arguments, options):
@@ -45,10 +40,12 @@ def table(name, counts, cells, arguments, options):
 
 def draw(path, tables):
     """Multiplications and seconds, a line for each table."""
-    with picture(path, 2) as axes:
-        for panel, (x, y, what, log) in zip(axes, PANELS, strict=True):
-            lines = {title.split(":")[0]: rows for title, rows in tables.items()}
-            curves(panel, "weak scaling", (x, what), lines, (x, y), log)
+    lines, title = {title.split(":")[0]: rows for title, rows in tables.items()}, "weak scaling"
+    with picture(path, 2) as (left, right):
+        columns, what = ("subdomains", "F"), "multiplications by F"
+        curves(left, title, (columns[0], what), lines, columns, "x")
+        columns, what = ("unknowns", "processor"), "processor seconds of all ranks"
+        curves(right, title, (columns[0], what), lines, columns)
 
 
 def main(argv):

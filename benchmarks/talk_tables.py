@@ -50,6 +50,7 @@ TABLES = {
     "Tresca 3D": ("tresca_3d", TRESCA_3D),
     "TBETI": ("tbeti_cube_3d", TBETI),
 }
+SHARES = ("sticking", "sliding")  # of the contact nodes, where there is friction
 SOLVERS = {
     "Newton": ["-tfeti_qp_type", "newton"],
     "SMALSE": ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none"],
@@ -60,8 +61,7 @@ def row(reports, talk, subdomains, rtol):
     """A row of a table: ours beside the talk's."""
     primal, dual, kernel, multiplications, seconds = talk
     newton, smalse = reports["Newton"], reports["SMALSE"]
-    shares = {"sticking": newton.sticking, "sliding": newton.sliding}
-    rubbing = {name: count / newton.contact_rows for name, count in shares.items()}
+    rubbing = {name: getattr(newton, name) / newton.contact_rows for name in SHARES}
     return {
         "subdomains": subdomains,
         "rtol": f"{rtol:.0e}",

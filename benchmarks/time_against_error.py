@@ -341,8 +341,7 @@ def study(name: str, arguments: Any, folder: Path) -> Tables:
 
     def run(case: Case) -> list[dict[str, Any]]:  # in processes of its own
         words = [sys.executable, __file__, "--worker", json.dumps(asdict(case)), FILE, reference]
-        found: list[dict[str, Any]] = json_of(words, case.ranks)["rows"]
-        return found
+        return list(json_of(words, case.ranks)["rows"])
 
     best = run(finest)[-1]
     rows, by_name = [], {}

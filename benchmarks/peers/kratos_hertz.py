@@ -88,35 +88,28 @@ def filled(part, data):
     part.CreateSubModelPart("axis").AddNodes((np.unique(data["axis"]) + 1).tolist())
 
 
-def solve(data, folder):
-    """Places, pressures there, unknowns and steps."""
-    materials, model = folder / "materials.json", Kratos.Model()
+def prepare(data):
+    """The program, and a solve: places, pressures there, unknowns and steps."""
+    Kratos.Logger.GetDefaultOutput().SetSeverity(Kratos.Logger.Severity.WARNING)
     numbers = {"YOUNG_MODULUS": UNIT * float(data["E"]), "POISSON_RATIO": float(data["nu"])}
     law = {"constitutive_law": {"name": "LinearElasticPlaneStrain2DLaw"}, "Tables": {}}
     whole = {"model_part_name": "Structure", "properties_id": 1}
     whole["Material"] = {**law, "Variables": numbers}
+    materials = Path(tempfile.mkdtemp()) / "materials.json"
     materials.write_text(json.dumps({"properties": [whole]}))
     load = UNIT * float(data["traction"])
     words = PARAMETERS.replace("<load>", f"{load:.17e}").replace("<materials>", str(materials))
-    analysis = structural_mechanics_analysis.StructuralMechanicsAnalysis(
-        model, Kratos.Parameters(words)
-    )
-    part = model["Structure"]
-    filled(part, data)
-    analysis.Run()
-    nodes, scale = np.unique(data["contact"]), -part.ProcessInfo[Kratos.SCALE_FACTOR] / UNIT
-    name = Contact.LAGRANGE_MULTIPLIER_CONTACT_PRESSURE
-    pressure = [scale * part.Nodes[int(k) + 1].GetSolutionStepValue(name) for k in nodes]
-    steps = part.ProcessInfo[Kratos.NL_ITERATION_NUMBER]
-    return data["points"][nodes, 0], pressure, data["points"].size, steps
 
+    def solve():
+        model, parameters = Kratos.Model(), Kratos.Parameters(words)
+        analysis = structural_mechanics_analysis.StructuralMechanicsAnalysis(model, parameters)
+        part = model["Structure"]
+        filled(part, data)
+        analysis.Run()
+        nodes, scale = np.unique(data["contact"]), -part.ProcessInfo[Kratos.SCALE_FACTOR] / UNIT
+        name = Contact.LAGRANGE_MULTIPLIER_CONTACT_PRESSURE
+        pressure = [scale * part.Nodes[int(k) + 1].GetSolutionStepValue(name) for k in nodes]
+        steps = part.ProcessInfo[Kratos.NL_ITERATION_NUMBER]
+        return data["points"][nodes, 0], pressure, data["points"].size, steps
 
-def prepare(data):
-    """The program, and a solve."""
-    Kratos.Logger.GetDefaultOutput().SetSeverity(Kratos.Logger.Severity.WARNING)
-
-    def once():
-        with tempfile.TemporaryDirectory() as folder:
-            return solve(data, Path(folder))
-
-    return f"Kratos {metadata.version('KratosMultiphysics')}", once
+    return f"Kratos {metadata.version('KratosMultiphysics')}", solve

@@ -110,13 +110,8 @@ def _of_pairs(
         met = np.flatnonzero(area)
         W = diags_array(1.0 / area[met]) @ (D - M)[met]
         normals = np.tile(sign * np.eye(scene.gdim)[axis], (len(met), 1))
-        yield (
-            csr_array(W),
-            normals,
-            np.full(len(met), sign * (at[1] - at[0])),
-            area[met],
-            pair.friction,
-        )
+        gap = np.full(len(met), sign * (at[1] - at[0]))
+        yield csr_array(W), normals, gap, area[met], pair.friction
 
 
 def _rows(W: csr_array, axes: np.ndarray) -> csr_array:

@@ -334,8 +334,8 @@ def run_scene(scene: Scene) -> dict[str, Any]:
 
 
 def _solved(scene: Scene, row: dict[str, Any]) -> str:
-    made = blocks(scene)
-    (problem, move), check, missed = posed(scene, *made), Check(scene, *made), list[str]()
+    made, missed = blocks(scene), list[str]()
+    (problem, move), check = posed(scene, *made), Check(scene, *made)
     row["F"] = row["newton"] = 0
 
     def advance(start: np.ndarray, end: np.ndarray, halvings: int) -> None:
