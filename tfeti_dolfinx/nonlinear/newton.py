@@ -33,7 +33,8 @@ class NewtonTolerances:
         flattest: And at most this: at that of a kept tangent a new one would be solved to more
             than it moves.
         near: In small strain a linearised problem that comes within so many times ``rtol`` is the
-            last but one, as a rule.
+            last but one, as a rule. In finite strain increments within it say nothing of
+            ``turning``: they are what tolerances of linearised problems leave, too.
         last: It is solved to so many times ``rtol``, which leaves little to the last one.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
@@ -105,13 +106,16 @@ class ModelKeeping:
         """Begin a load step with a new model."""
         self.kept, self._first, self._of_model, self._before = False, 0.0, 0.0, 0.0
 
-    def next(self, size: float, t: float) -> bool:
-        """Return whether to keep the model after an increment and its length t."""
+    def next(self, size: float, t: float, near: float) -> bool:
+        """Return whether to keep the model after an increment and its length t.
+
+        Increments up to ``near`` are near the tolerance.
+        """
         tol = self._tolerances
         self._first, slow = self._first or size, self.kept and size > tol.slow * self._before
         if self._finite:
             if not self.kept:
-                turns = self._of_model > 0.0 and size > tol.turning * self._of_model
+                turns = self._of_model > 0.0 and size > max(tol.turning * self._of_model, near)
                 self._freezes, self._of_model = self._freezes and not turns, size
             good = self._freezes and (not self.kept or size > tol.frozen * self._of_model)
         else:

@@ -234,7 +234,7 @@ class NonlinearContactProblem(ContactProblem):
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
                     faster.forget()
                     self._set(u + d)
-            forms.kept = keeping.next(size, t)
+            forms.kept = keeping.next(size, t, tol.near * exact * largest(comm, end))
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
             f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
