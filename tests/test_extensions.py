@@ -1,5 +1,7 @@
 """Parts of one's own through ContactProblem: an inverse, a preconditioner, a monitor."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scenes import apart, curved_obstacle, decomposed, problem
@@ -7,8 +9,8 @@ from scipy.linalg import pinvh
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.operator import DualOperator
+from tfeti_dolfinx.feti.projectors import FaceFactors, NullModes
 from tfeti_dolfinx.feti.stopping import Accuracy
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -73,9 +75,11 @@ def test_subdomains_and_deflation_of_one_s_own():
         asked.append("subdomains")
         return Subdomains
 
-    def deflation(*given):
+    def deflation(B, coarse, weights, prefix):
         asked.append("deflation")
-        return SoftModes(*given)
+        factors = FaceFactors(coarse.comm, NullModes(coarse.null), prefix)
+        own = {"balanced": lambda face, on_face: on_face, "destroy": lambda: None}
+        return SimpleNamespace(count=0, factors=factors, **own)
 
     own = Extensions(subdomains=subdomains, deflation=deflation)
     known, _ = solved()

@@ -31,11 +31,12 @@ class Counted:
         return getattr(self._comm, name)
 
 
-@pytest.fixture(scope="module")
-def dual():
+@pytest.fixture(scope="module", params=[0.0, 1e-3], ids=["floating", "springs"])
+def dual(request):
     d = decomposed("hexahedron", 4, subdomains=6)
     obstacle = tfeti.Obstacle("bottom", curved_obstacle(3))
-    p = problem(d, contacts=[obstacle], tfeti_pc_type="dirichlet", tfeti_qp_type="newton")
+    options = {"tfeti_pc_type": "dirichlet", "tfeti_qp_type": "newton"}
+    p = problem(d, contacts=[obstacle], springs=request.param, **options)
     made = dual_of(p)
     made.coarse.comm = Counted(made.coarse.comm)
     yield made

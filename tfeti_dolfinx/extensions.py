@@ -14,8 +14,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.validation import checked_callable, checked_type, named, shown
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.feti.deflation import MakeDeflation
-from tfeti_dolfinx.feti.dual import FeasibleLaw, contact_set
+from tfeti_dolfinx.feti.dual import FeasibleLaw, MakeDeflation, contact_set
 from tfeti_dolfinx.feti.operator import MakePreconditioner
 from tfeti_dolfinx.feti.stopping import Accuracy, MakeRule
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -57,8 +56,7 @@ class Extensions:
             the arguments of ``Subdomains``.
         preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, for solvers that
             take one.
-        deflation: Makes the coarse space of the preconditioner on active sets; default
-            ``SoftModes``.
+        deflation: Makes a coarse space of the preconditioner on active sets.
         feasible_set: From B and c to the set of multipliers, asked before each run of the solver;
             ``check_feasible_set`` tests it.
         stopping: Makes the stopping rule of a solve, say a class derived from ``Accuracy``.

@@ -42,7 +42,7 @@ LOOSEST = 1e-2
 MECHANISMS = {
     "d_scaling": "constraints weighted by the diagonal of K, not by the number of copies",
     "smooth_displacements": "displacements with given jumps made smooth in the preconditioner",
-    "soft_springs": "motions that springs hold softly as a coarse space of the preconditioner",
+    "soft_springs": "soft springs are taken out of the stiffness of subdomains",
     "kept_directions": "directions of PCPG conjugate to all before, not to the last one alone",
     "recycled_directions": "directions of earlier solves",
     "newton_on_coulomb": "Newton's method on Coulomb's law, before bounds as a fixed point",

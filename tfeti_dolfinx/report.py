@@ -104,7 +104,7 @@ class SolverCounts:
     expansion_steps: int = 0
     proportioning_steps: int = 0
     face_factorizations: int = 0  # of G_f G_fᵀ, f a face of the rows
-    soft_factorizations: int = 0  # of soft motions, or of whole clusters, one for a face
+    soft_factorizations: int = 0  # of motions of whole clusters, one for a face
     newton_steps: int = 0  # of a nonlinear problem, each a linearised problem
 
     @classmethod
@@ -112,7 +112,7 @@ class SolverCounts:
         cls, dual: Dual, result: QPResult, accuracy: Accuracy, settling: FixedPointStatus
     ) -> Self:
         """Return the counts of a solver's run."""
-        preconditioner, soft, steps = dual.preconditioner, dual.soft, result.steps
+        preconditioner, inner, steps = dual.preconditioner, dual.deflation, result.steps
         return cls(
             F_multiplications=dual.F.count["solver"],
             preconditioner_multiplications=(
@@ -128,7 +128,7 @@ class SolverCounts:
             expansion_steps=steps.expansion,
             proportioning_steps=steps.proportioning,
             face_factorizations=dual.coarse.factors.count,
-            soft_factorizations=0 if soft is None else soft.factors.count,
+            soft_factorizations=0 if inner is None else inner.factors.count,
         )
 
 
@@ -201,7 +201,7 @@ class Outcome:
     contacts: list[ContactSummary] = field(default_factory=list)
     clusters: int = 0  # of subdomains that averages glue
     kernel_dim: int = 0  # of K
-    soft_modes: int = 0  # motions that springs hold softly, or all of clusters: preconditioned
+    soft_modes: int = 0  # motions that springs hold softly, or all of clusters
     free_modes: int = 0  # rigid motions that nothing resists and the load does not drive
     # rigid motions that contacts with a force hold hardly or not (0): bodies, mode, stiffness
     nearly_free: list[dict[str, Any]] = field(default_factory=list)
@@ -246,7 +246,7 @@ class Outcome:
             contacts=ContactSummary.of_solution(solution),
             clusters=dual.subdomains.num_clusters,
             kernel_dim=dual.coarse.dimension,
-            soft_modes=0 if dual.soft is None else dual.soft.count,
+            soft_modes=dual.coarse.num_springs if dual.deflation is None else dual.deflation.count,
             free_modes=dual.coarse.free_motions.count,
             nearly_free=nearly_free,
             excluding_contacts=excluding,

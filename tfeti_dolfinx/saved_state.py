@@ -98,6 +98,9 @@ def labels_of_rows(gluing: Gluing, of_groups: Array) -> Array:
     group[sets.tangents] = of_groups[records.group[tangent]][:, None]
     kind[sets.tangents] = 2 * records.contact[tangent][:, None] + 1
     place[sets.tangents] = np.arange(sets.tangents.shape[1])
+    group[sets.springs] = dofs.subdomains[sets.springs_of].astype(np.int64) << SHIFT
+    kind[sets.springs] = -2
+    place[sets.springs] = np.arange(len(sets.springs))
     labels[:] = numbered(group >> SHIFT, group, kind, place)
     return labels
 

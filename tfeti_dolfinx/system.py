@@ -21,7 +21,6 @@ from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.forms.assembly import Data, Forms
@@ -31,6 +30,7 @@ from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.solve.solver import resolved
 from tfeti_dolfinx.subdomains.block import RigidBlock, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.factor import added_options, say_if_not_cholmod
+from tfeti_dolfinx.subdomains.kplus import TOLERANCES as INVERSES
 from tfeti_dolfinx.subdomains.kplus import InverseFactory, regularised
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
@@ -95,6 +95,8 @@ class Settings:
         expected = options.local_multiplications // (OF_TANGENT if tangents else 1)
         choice = LocalChoice(options.local_type, expected)
         found = equals if choice.type in ("auto", "shared") else None
+        keeps = own.subdomains is not None or "soft_springs" in options.without
+        equals.how.soft = 0.0 if keeps else INVERSES.weak if tangents else INVERSES.soft
         make = own.block or (lambda item: SparseBlock(item, equals.how, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
@@ -150,7 +152,7 @@ class Settings:
                 preconditioner=preconditioner or PRECONDITIONERS.get(options.pc_type),
                 options_prefix=self.prefix,
                 feasible=feasible,
-                deflation=self.extensions.deflation or SoftModes,
+                deflation=self.extensions.deflation,
                 without=options.without,
                 recycle=options.recycle,
                 dimension=gdim,
@@ -485,6 +487,13 @@ class System:
 
     def _make_dual(self) -> None:
         law, names = self._settings.extensions.feasible_set, self.tools.free_names
+        of_springs = np.repeat(
+            np.arange(len(self.subdomains.blocks)),
+            [part.stop - part.start for part in self.subdomains.spring_parts],
+        )
+        constraints = self.gluing.constraints.with_springs(of_springs)
+        if constraints is not self.gluing.constraints:
+            self._gluing = replace(self.gluing, constraints=constraints)
         self._dual = self._settings.make_dual(
             self.gluing.constraints, self.subdomains, self._dofs, law, names
         )

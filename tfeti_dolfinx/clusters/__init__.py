@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from tfeti_dolfinx.clusters.motions import motions_for
+from tfeti_dolfinx.clusters.motions import motions_of_clusters
 from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, clusters_of
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -17,4 +17,4 @@ def extension(wanted: int) -> dict[str, Any]:
     def subdomains(dofs: TornDofs, decomposition: Decomposition) -> Any:
         return partial(ClusteredSubdomains, clusters_of(dofs, decomposition, wanted))
 
-    return {"subdomains": subdomains, "deflation": motions_for}
+    return {"subdomains": subdomains, "deflation": motions_of_clusters}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -22,8 +24,7 @@ from tfeti_dolfinx.common.parallel import (
 )
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace, products, side_by_side
-from tfeti_dolfinx.feti.deflation import Balanced, Deflation, SoftModes, mean_stiffness
-from tfeti_dolfinx.feti.operator import DualOperator
+from tfeti_dolfinx.feti.operator import mean_stiffness
 from tfeti_dolfinx.feti.preconditioner import chebyshev
 from tfeti_dolfinx.feti.projectors import FaceFactors, NullModes, SemidefiniteFactor, replicated
 from tfeti_dolfinx.qp.problem import FaceOperator
@@ -190,6 +191,48 @@ def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
 # motions of all subdomains, takes that part of a jump, as P does without clusters.
 
 
+class Balanced:
+    """M = (I − YC)ᵀ M_f (I − YC) + CᵀDC with C = XYᵀ, beside a part that is solved for apart.
+
+    Mandel, Comm. Numer. Methods Engrg. 9, 1993, 233–241. Where D = (CFCᵀ)⁻¹ and Y = FCᵀD it is the
+    inverse of F on the range of Cᵀ; what is only near to that remains positive semidefinite, and
+    definite if no x has both (I − YC)x = 0 and DCx = 0. Vectors of rows are this rank's parts;
+    coordinates may be replicated or distributed. The functions are collective.
+
+    Args:
+        on_face: M_f, which is taken over.
+        energy: D, shape of the coordinates.
+        solve: X c.
+        forces: Y c, in the face.
+        moved: Yᵀ y, y in the face.
+        owned: What is destroyed with it.
+    """
+
+    def __init__(
+        self,
+        on_face: FaceOperator,
+        energy: Array,
+        *,
+        solve: Callable[[Array], Array],
+        forces: Callable[[Array], Array],
+        moved: Callable[[Array], Array],
+        owned: Sequence[Any] = (),
+    ) -> None:
+        self._on_face, self._energy, self._owned = on_face, energy, owned
+        self._solve, self._forces, self._moved = solve, forces, moved
+
+    def __call__(self, x: Array) -> Array:
+        """M x, x in the face. Collective."""
+        c = self._solve(self._moved(x))
+        y = self._on_face(x - self._forces(c))
+        return y - self._forces(self._solve(self._moved(y) - self._energy * c))
+
+    def destroy(self) -> None:
+        """Free what it has been given. Collective."""
+        for item in (self._on_face, *self._owned):
+            item.destroy()
+
+
 class ClusterMotions:
     """Ĝ of the rigid motions of all subdomains, in clusters.
 
@@ -310,14 +353,12 @@ class ClusterMotions:
         self._whole.destroy()
 
 
-def motions_for(
-    B: PETSc.Mat, coarse: CoarseSpace, weights: Array, preconditioner: DualOperator, prefix: str
-) -> Deflation:
-    """Return the motions of subdomains in clusters; soft springs where there are no clusters."""
-    subdomains = coarse.subdomains
-    if isinstance(subdomains, ClusteredSubdomains):
-        return ClusterMotions(B, coarse, subdomains, weights, prefix)
-    return SoftModes(B, coarse, weights, preconditioner, prefix)
+def motions_of_clusters(
+    B: PETSc.Mat, coarse: CoarseSpace, weights: Array, prefix: str
+) -> ClusterMotions:
+    """Return the motions of subdomains in clusters. Collective."""
+    assert isinstance(coarse.subdomains, ClusteredSubdomains)
+    return ClusterMotions(B, coarse, coarse.subdomains, weights, prefix)
 
 
 def _gram(Gt: csr_array) -> csr_array:

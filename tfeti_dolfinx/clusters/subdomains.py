@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.arrays import Array, joined, parts_of
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.block import OperatorKind, candidate_modes
+from tfeti_dolfinx.subdomains.block import OperatorKind, candidate_modes, outside_motions
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import TOLERANCES as ROUNDING
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -479,9 +479,21 @@ class ClusteredSubdomains(Subdomains):
         """R̃ᵀC, C the candidate modes of all bodies, shape ``(r̃, b * k)``."""
         return csr_array(self.null.T @ super().modes_in_kernel)
 
+    def _held_motions(self) -> tuple[csr_array, Array]:
+        """Return motions R̂ of Blocks that springs hold, on the trace, and diagonal R̂ᵀKR̂."""
+        parts, energies = list[Array](), list[Array]()
+        for block in self.blocks:
+            U = outside_motions(block.modes, block.kernel)
+            KU = np.array([block.multiply(u) for u in U.T]).reshape(U.T.shape).T
+            energy, V = np.linalg.eigh(U.T @ KU)
+            parts.append((U @ V)[block.trace_dofs])
+            energies.append(np.maximum(energy, 0.0))
+        rows = csr_array(block_diag(parts)) if parts else csr_array((0, 0))
+        return rows, joined(energies)
+
     def inner_motions(self) -> InnerMotions:
         """Rigid motions of the subdomains, those first that are in their kernels."""
-        R, (held, energy) = super().kernel_rows, self.soft_motions()
+        R, (held, energy) = super().kernel_rows, self._held_motions()
         rows = csr_array(hstack((R, held)))
         energy = np.concatenate((np.zeros(R.shape[1]), energy))
         sizes = [part.stop - part.start for part in self.trace_parts]

@@ -342,6 +342,8 @@ class Gluing:
         flags, flags_before = self.prescribed.flag, earlier.prescribed.flag
         if not any_rank(self.dofs.comm, not np.array_equal(flags, flags_before)):
             start[sets.equalities] = lam[before.equalities]
+        if np.array_equal(sets.springs_of, before.springs_of):
+            start[sets.springs] = lam[before.springs]
         # ratios: of rows that stay they are exactly 1, and what F makes of the start is known
         pairs: list[tuple[Any, Any, Array, Array]] = [
             (self.contact, earlier.contact, sets.normals[:, None], before.normals[:, None]),

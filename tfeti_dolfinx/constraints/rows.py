@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import Exchange, chunk_offsets, owner_of
+from tfeti_dolfinx.common.parallel import Exchange, any_rank, chunk_offsets, owner_of
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -75,6 +75,10 @@ class RowSets:
     equalities: Array  # gluing rows, and rows that hold prescribed components, shape (e,)
     normals: Array  # rows of contact conditions along their normals, λ ≥ 0, shape (n,)
     tangents: Array  # rows along the tangents of conditions with friction, shape (t, gdim - 1)
+    # rows of soft springs, which no unknown of the mesh is in, and this rank's subdomain of each,
+    # shape (k,)
+    springs: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    springs_of: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     @property
     def contact(self) -> Array:
@@ -154,6 +158,24 @@ class Constraints:
         rows.setArray(lam)
         self.B.multTranspose(rows, trace)
         return _taken(trace, rows)
+
+    def with_springs(self, subdomain: Array) -> Constraints:
+        """Return rows with those of springs, each of a subdomain of this rank, behind the others.
+
+        B, which the rows come with, is destroyed where they are other ones. Collective.
+        """
+        comm, sets = self.B.getComm().tompi4py(), self.sets
+        if not any_rank(comm, not np.array_equal(subdomain, sets.springs_of)):
+            return self
+        indptr, indices, data = self.B.getValuesCSR()
+        rows, count = self.num_rows - len(sets.springs), len(subdomain)
+        table = np.append(indptr[: rows + 1], np.full(count, indptr[-1], dtype=indptr.dtype))
+        size = ((rows + count, None), (self.B.getLocalSize()[1], None))
+        B = PETSc.Mat().createAIJ(size=size, csr=(table, indices, data), comm=self.B.getComm())
+        self.B.destroy()
+        c = np.append(self.c[:rows], np.zeros(count))
+        sets = replace(sets, springs=rows + np.arange(count), springs_of=subdomain)
+        return replace(self, B=B, c=c, sets=sets)
 
     @property
     def pressed(self) -> Array:

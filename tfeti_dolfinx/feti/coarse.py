@@ -7,10 +7,16 @@ from typing import Any, cast
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
+from tfeti_dolfinx.common.parallel import (
+    any_rank,
+    bcast_from_root,
+    chunk_offsets,
+    joined_over,
+    summed,
+)
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
     FaceFactors,
@@ -38,8 +44,9 @@ class CoarseSpace(Coarse):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
 
     G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
-    ``bounded`` are local rows with λ ≥ 0, ``rubbing`` those of friction. Creation and all methods
-    are collective.
+    ``bounded`` are local rows with λ ≥ 0, ``rubbing`` those of friction, ``springs`` those of
+    springs, behind all others: √(D/σ) WᵀR of these, so that F is 1/σ there. Creation and all
+    methods but ``spring_ends`` are collective.
 
     Attributes:
         dimension: r, the dimension of the kernel of K.
@@ -66,6 +73,8 @@ class CoarseSpace(Coarse):
         subdomains: Subdomains,
         bounded: Array,
         rubbing: Array,
+        springs: Array,
+        sigma: float,
         prefix: str = "tfeti_coarse_",
     ) -> None:
         self.subdomains, self.bounded, self.rubbing = subdomains, bounded, rubbing
@@ -75,26 +84,38 @@ class CoarseSpace(Coarse):
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         Gt = transposed_G(B, kernel, dimension)
+        self.springs, self.sigma = springs, sigma
+        self.num_springs = int(summed(comm, np.array([len(springs)]))[0])
+        per_spring = csr_array(subdomains.spring_rows / np.sqrt(sigma))
+        if len(springs):  # behind all others
+            place = (per_spring.data, self._own.start + per_spring.indices, per_spring.indptr)
+            wide = csr_array(place, shape=(len(springs), dimension))
+            Gt = csr_array(vstack((Gt[: -len(springs)], wide)))
         indptr, _, data = B.getValuesCSR()
         row = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
         sizes = np.bincount(row, np.abs(data), minlength=len(indptr) - 1).astype(float)
+        sizes[springs] = np.sqrt(per_spring.power(2).sum(axis=1))
         self.row_size = np.where(sizes > 0.0, sizes, 1.0)
         self.bodies = Bodies(subdomains)
         self.J = self._on_bodies(Gt)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[np.concatenate((bounded, rubbing))] = False
-        self.unheld = self.unresisted(equalities, self.bodies.unsprung)
+        self.unheld = self._unglued = self.unresisted(equalities, self.bodies.unsprung)
+        glues = np.array(equalities)
+        glues[springs] = False
+        if self.num_springs:
+            self._unglued = self.unresisted(glues, self.bodies.unsprung)
         self.free_motions = self.unresisted(~equalities)
         both = self.free_motions.columns
         self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
         # made on one rank: processors that round differently might choose differently
         self._basis = bcast_from_root(
-            comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
+            comm, kernel_basis(self.bodies, self._unglued, self.free_motions)
         )
         self.motions = self._basis.coordinates
         self.work = self.motions.transposed
         rows = replace(self.J, parts=self.J.parts * self.row_size[self.J.row, None])
-        Gt = self._basis.rows(Gt, rows, equalities)
+        Gt = self._basis.rows(Gt, rows, glues)
         null = self.motions.csr() @ both if both.shape[1] else csr_array((dimension, 0))
         self.null = bcast_from_root(comm, orthonormal_columns(null))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
@@ -109,7 +130,7 @@ class CoarseSpace(Coarse):
         if not self.dimension:
             return np.zeros(0)
         e = self._basis.transposed(joined_over(self.comm, self.subdomains.kernel_load))
-        basis, Z = self._basis, self.unheld
+        basis, Z = self._basis, self._unglued
         work = np.einsum("bij,bi->bj", Z.single, self.work(e).reshape(Z.free.shape)) * Z.free
         still = np.linalg.norm(work, axis=1) <= self.bodies.unloaded
         e[np.flatnonzero((basis.unheld & still[:, None])[basis.kept])] = 0.0
@@ -136,6 +157,14 @@ class CoarseSpace(Coarse):
     def kernel_motion(self, alpha: Array) -> Array:
         """R T α of an r-vector on all unknowns of this rank, shape ``(n,)``."""
         return self.subdomains.kernel_motion(self._basis.kernel(alpha)[self._own])
+
+    def spring_ends(self, lam: Array, u: Array) -> Array:
+        """Return how far the ends of springs move under λ and u, which rows hold, shape ``(k,)``.
+
+        √(D/σ) Wᵀu − λ/σ, in the length that makes a spring as stiff as a row.
+        """
+        stretched = self.subdomains.spring_motions(u) / np.sqrt(self.sigma)
+        return np.asarray(stretched - lam[self.springs] / self.sigma)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -15,16 +15,17 @@ from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, no
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.feti.deflation import Deflation, MakeDeflation, SoftModes, mean_stiffness
 from tfeti_dolfinx.feti.operator import (
     DualOperator,
     LateDirichlet,
     MakePreconditioner,
     chosen_preconditioner,
     dirichlet_preconditioner,
+    mean_stiffness,
     scaled_rows,
 )
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
+from tfeti_dolfinx.feti.projectors import FaceFactors
 from tfeti_dolfinx.feti.rigid_bodies import free_to_move, listed
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
@@ -72,6 +73,23 @@ def contact_set(constraints: Constraints) -> FeasibleSet:
     return Product([normals, (sets.tangents.ravel(), Ellipses(constraints.limits))])
 
 
+class Deflation(Protocol):
+    """A coarse space of a preconditioner on faces."""
+
+    count: int  # number of its motions, of all subdomains
+    factors: FaceFactors  # makes the factors of faces, and counts them
+
+    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
+        """Return M_f, which is taken over, with these motions. Collective."""
+
+    def destroy(self) -> None:
+        """Free what belongs to it. Collective."""
+
+
+# from B, the natural coarse space, weights and a prefix of options
+MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, str], Deflation]
+
+
 class Dual:
     """F, G, d and e of a scene. Creation and all methods are collective.
 
@@ -86,8 +104,7 @@ class Dual:
         d: B K⁺ f − c, this rank's part.
         preconditioner: The preconditioner, or None; ``late``: itself, where it may change.
         coarse: The coarse space.
-        soft: Motions that springs hold softly, or of subdomains in clusters, for the
-            preconditioner; None without one.
+        deflation: Coarse space of the preconditioner, as clusters have one; else None.
         contact_rows: Number of normal and of tangential rows on all ranks.
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         law: Makes the set of multipliers from B and c.
@@ -107,7 +124,7 @@ class Dual:
         preconditioner: MakePreconditioner | None = None,
         options_prefix: str = "tfeti_",
         feasible: FeasibleLaw = contact_set,
-        deflation: MakeDeflation = SoftModes,
+        deflation: MakeDeflation | None = None,
         without: Collection[str] = (),
         recycle: int | str = 0,
         dimension: int = 3,
@@ -145,10 +162,20 @@ class Dual:
         self._nearly_free: tuple[Array, list[dict[str, Any]]] | None = None
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
-        self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
-        self.soft: Deflation | None = None
-        if self.preconditioner is not None and "soft_springs" not in without:
-            self.soft = deflation(B, self.coarse, constraints.weights, self.preconditioner, prefix)
+        springs, sigma = constraints.sets.springs, 1.0
+        if not any_rank(comm, any(own is not None for own in subdomains.springs)):
+            springs = springs[:0]
+        else:
+            sigma = mean_stiffness(subdomains, constraints.weights)
+            on_springs: Array = np.zeros(constraints.num_rows)
+            on_springs[springs] = 1.0
+            self.F.added = on_springs / sigma
+            if self.preconditioner is not None:
+                self.preconditioner.added = sigma * on_springs
+        self.coarse = CoarseSpace(B, subdomains, normals, tangents, springs, sigma, prefix)
+        self.deflation: Deflation | None = None
+        if self.preconditioner is not None and deflation is not None:
+            self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms = dict[int, float]()  # of so many Lanczos steps
@@ -248,8 +275,8 @@ class Dual:
             if operator is not None:
                 operator.count.clear()
         self.coarse.factors.count = 0
-        if self.soft is not None:
-            self.soft.factors.count = 0
+        if self.deflation is not None:
+            self.deflation.factors.count = 0
 
     def qp(self, norm_steps: int = 0) -> QP:
         """Return the quadratic program; without kernel it has no coarse problem.
@@ -274,6 +301,7 @@ class Dual:
             recycled=self.recycled,
             keeps="kept_directions" not in self._without,
             cautious="cautious" not in self._without,
+            sprung=self.coarse.num_springs > 0,
             foundation=None if "foundation" in self._without else self.foundation,
         )
 
@@ -295,7 +323,7 @@ class Dual:
         """Return the preconditioner on all rows, made once."""
         given = self.preconditioner
         smooths = given is not None and (given is self.late or given.metric is not None)
-        count = 0 if self.soft is None else self.soft.count
+        count = 0 if self.deflation is None else self.deflation.count
         if not (count or (smooths and not any(self.contact_rows))):
             return self.preconditioner
         if self._on_all is None:
@@ -324,7 +352,7 @@ class Dual:
                 self.preconditioner, self.constraints, diagonal, self._prefix
             )
         made = self._on_faces.on_face(face)
-        return made if self.soft is None else self.soft.balanced(face, made)
+        return made if self.deflation is None else self.deflation.balanced(face, made)
 
     @property
     def driving(self) -> Array:
@@ -370,7 +398,7 @@ class Dual:
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
         last = None if self._on_last is None else self._on_last[1]
-        own = (last, self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
-        for item in (self.F, *own):
+        own = (last, self._on_all, self._on_faces, self.deflation, self.preconditioner)
+        for item in (self.F, *own, self._scaled):
             if item is not None:
                 item.destroy()

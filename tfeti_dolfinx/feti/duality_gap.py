@@ -35,7 +35,8 @@ def energy_bound(
 
     which is at least ½‖v − u*‖²_K + ½‖u − u*‖²_K (Prager, Synge, Q. Appl. Math. 5, 1947). All terms
     are differences already: nothing cancels. v closes on the trace what rows miss, and is extended
-    harmonically: ‖v − u‖²_K is δᵀSδ. It costs one multiplication by S, and one solve in each
+    harmonically: ‖v − u‖²_K is δᵀSδ; what ends of springs move comes to its root.
+    It costs one multiplication by S, and one solve in each
     subdomain more where λ does not balance the load. ``norm`` is ‖F‖, or an estimate, or 0;
     ``balanced`` the worst entry of Gλ − e beside its terms from which on the forces are balanced.
     """
@@ -45,9 +46,11 @@ def energy_bound(
     change, loss = admissible(dual, forces, displacement, norm)
     lifted = np.empty_like(change)
     dual.lifting.mult(change, lifted)
-    comm = dual.coarse.comm
-    energy, own = summed(comm, np.array([0.5 * float(change @ lifted), loss]))
-    gap = bcast_from_root(comm, float(max(energy + own, 0.0)))
+    comm, ends = dual.coarse.comm, dual.coarse.spring_ends(forces, displacement)
+    own = np.array([change @ lifted, dual.coarse.sigma * (ends @ ends), loss])
+    moved, stretched, lost = summed(comm, own)
+    energy = 0.5 * (np.sqrt(max(moved, 0.0)) + np.sqrt(stretched)) ** 2
+    gap = bcast_from_root(comm, float(max(energy + lost, 0.0)))
     return EnergyBound(apart + float(np.sqrt(2.0 * gap)), gap, apart)
 
 
@@ -111,6 +114,7 @@ def _balanced(
     wanted = lam
     if norm > 0.0:
         missed = constraints.jumps(u[subdomains.trace]) - constraints.c
+        missed[coarse.springs] = coarse.spring_ends(lam, u)
         wanted = lam + missed / norm
     found, _ = project_onto_feasible(coarse, dual.feasible, wanted)
     if imbalance(coarse, found) > HELD:
@@ -120,6 +124,7 @@ def _balanced(
     change = elastic_displacement(constraints, subdomains, found - lam, zero)
     if coarse.dimension:
         rows = constraints.jumps(change[subdomains.trace])
+        rows[coarse.springs] = coarse.spring_ends(found - lam, change)
         change = change - coarse.kernel_motion(coarse.solve(coarse.G(rows)))
     energy = summed(coarse.comm, np.array([sum(subdomains.energies(change))]))[0]
     return found, u + change, float(np.sqrt(max(energy, 0.0)))

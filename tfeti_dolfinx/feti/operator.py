@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array, entries_of_rows, entries_within, joined, node_means
-from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
@@ -102,6 +102,7 @@ class DualOperator:
     def __init__(self, B: PETSc.Mat, local: LocalOperator, metric: Metric | None = None) -> None:
         self.B, self.local, self.metric = B, local, metric
         self.count: Counter[str] = Counter()
+        self.added: Array | float = 0.0  # of rows of springs
         self._payer, self.seconds, self.times = "solver", 0.0, 0
         self._w, self._x = B.createVecs()
         self._v = self._w.duplicate()
@@ -125,7 +126,7 @@ class DualOperator:
         self.B.multTranspose(self._x, self._w)
         self.multiply(self._w.array_r, self._v.array)
         self.B.mult(self._v, self._x)
-        return np.array(self._x.array_r)
+        return np.asarray(self._x.array_r + self.added * x)
 
     def multiply(self, w: Array, out: Array) -> None:
         """out = diag(A_s) w on this rank's trace, which counts as a multiplication."""
@@ -218,6 +219,13 @@ def chosen_preconditioner(
     if any_rank(subdomains.comm, dear) and not any_rank(subdomains.comm, other or held or stiff):
         return LateDirichlet(B, subdomains, choice.steps)
     return dirichlet_preconditioner(B, subdomains)
+
+
+def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:
+    """σ, the mean stiffness of a row scaled with D, the weights. Collective."""
+    terms = np.array([np.sum(subdomains.diagonal / weights), len(weights)])
+    stiffness, unknowns = summed(subdomains.comm, terms)
+    return float(stiffness / max(unknowns, 1.0))
 
 
 MakePreconditioner = Callable[[PETSc.Mat, Subdomains], DualOperator]

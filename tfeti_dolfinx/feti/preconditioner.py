@@ -223,7 +223,7 @@ class _OnFace:
         v[size:] = sizes * u[size:]
         on.whole.multiply(u[:trace], v[:trace])
         put_jumps(smoothed(on.steps, without_jumps, stiff, v))
-        return solved(y.array_r)
+        return solved(y.array_r) + on.whole.added * x
 
     def _solved(self, x: Array) -> Array:
         """Z W_κ⁻¹ Zᵀx on this rank's rows, where W_κ is not the identity."""

@@ -58,6 +58,7 @@ def recover(
     subdomains = coarse.subdomains
     u = elastic_displacement(constraints, subdomains, lam, subdomains.pinv_load)
     residual = constraints.c - constraints.jumps(u[subdomains.trace])  # = Fλ − d
+    residual[coarse.springs] = -coarse.spring_ends(lam, u)
     alpha: Array = np.zeros(0)
     if coarse.dimension:
         held = face.holding

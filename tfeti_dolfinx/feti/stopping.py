@@ -117,8 +117,12 @@ def measure(
     # 3. bodies
     u, subdomains, bodies = state.u, dual.subdomains, dual.coarse.bodies
     trace, diagonal = subdomains.trace_parts, subdomains.diagonal
+    closing = sums(diagonal * v**2, trace)
+    if len(sets.springs):
+        ends = sums(dual.coarse.sigma * w[sets.springs] ** 2, subdomains.spring_parts)
+        closing = [a + b for a, b in zip(closing, ends, strict=True)]
     energies, correction_energies, stiffness = subdomains.body_sums(
-        [subdomains.energies(u), sums(diagonal * v**2, trace), sums(diagonal, trace)]
+        [subdomains.energies(u), closing, sums(diagonal, trace)]
     )
     displacements = (
         u,

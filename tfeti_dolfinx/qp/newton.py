@@ -83,14 +83,14 @@ class NewtonParameters:
 def first_point(qp: QP) -> Array:
     """Step 0: the least λ with open contact if that balances the load, else that of a foundation.
 
-    With friction the latter: what is open would slip far first. Where e = 0 it is 0. Collective;
-    multiplies by nothing.
+    With friction or soft springs the latter: what is open would slip far first, or stretch springs
+    as far. Where e = 0 it is 0. Collective; multiplies by nothing.
     """
     zero = qp.feasible.project(np.zeros(len(qp.d)))
     if not np.any(qp.coarse.e) and not any_rank(qp.coarse.comm, zero):
         return zero
     face = qp.feasible.face(zero, zero)
-    if not any_rank(qp.coarse.comm, face.status >= RUBS):
+    if not qp.sprung and not any_rank(qp.coarse.comm, face.status >= RUBS):
         coarse = qp.coarse.on_face(face)
         lam = coarse.particular()
         held = imbalance(coarse, lam) <= HELD

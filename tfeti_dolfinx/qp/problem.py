@@ -68,6 +68,7 @@ class QP:
     # forces of a rank's rows if each were a spring that its gap presses, as stiff as bodies are
     # where so many rows carry together; None: unknown
     foundation: Callable[[int], Array] | None = None
+    sprung: bool = False  # whether rows of soft springs are among those that balance the load
 
     def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
         """Return xᵀy of pairs of vectors, rank 0's on every rank. Collective."""

@@ -101,7 +101,9 @@ class Predictor:
 
     def __init__(self, dofs: TornDofs, settings: Settings) -> None:
         self._dofs = dofs
-        options = replace(settings.options, recycle=0)  # of a mass there is little to learn
+        # of a mass there is little to learn, and no motion of it is soft
+        without = (*settings.options.without, "soft_springs")
+        options = replace(settings.options, recycle=0, without=without)
         self._settings = replace(settings, extensions=Extensions(), options=options)
         self._options = options
         self._M: csr_array | None = None

@@ -65,6 +65,7 @@ class KernelTolerances:
     # of (K⁺)_bb with a diagonal of ones, the inverse of its condition: below it soft parts of its
     # inverse, S, are rounding of stiff ones; with cells of moduli 1 : 1e6 1e-8 was too little
     invertible: float = 1e-6
+    in_kernel: float = 1e-6  # part of a mode of length 1 outside of the kernel that is rounding
 
 
 TOLERANCES = KernelTolerances()
@@ -86,6 +87,19 @@ def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
         for k, (j, i) in enumerate(combinations(range(gdim), 2)):
             modes[:, j, bs + k], modes[:, i, bs + k] = -y[:, i], y[:, j]
     return modes.reshape(len(x) * bs, -1)
+
+
+def outside_motions(modes: Array, R: Array) -> Array:
+    """Return an orthonormal basis of candidate modes orthogonal to a kernel, shape ``(n, k)``."""
+    count = modes.shape[1] - R.shape[1]
+    if count <= 0:
+        return np.zeros((len(modes), 0))
+    sizes = np.linalg.norm(modes, axis=0)
+    rest = modes / np.where(sizes > 0.0, sizes, 1.0)
+    for _ in range(2):  # once leaves rounding of the kernel
+        rest = rest - R @ (R.T @ rest)
+    U, sizes, _ = np.linalg.svd(rest, full_matrices=False)
+    return np.asarray(U[:, :count][:, sizes[:count] > TOLERANCES.in_kernel])
 
 
 def mode_names(gdim: int, bs: int) -> tuple[str, ...]:
@@ -144,6 +158,43 @@ def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
     return np.flatnonzero(chosen[node_of_dof])
 
 
+# --- Soft springs -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Springs:
+    """Springs from rigid motions of a subdomain to the ground: K = K₁ + W diag(D) Wᵀ.
+
+    As a Dirichlet condition is one of rows, so is the far end of a spring: without its springs a
+    subdomain floats, however soft they are. W are orthonormal rigid motions outside of the kernel R
+    of K, and D⁻¹ = WᵀK⁺W is diagonal. With N = K⁺WD the kernel of K₁ is that of R and N, and
+    (I − NWᵀ)K⁺(I − WNᵀ) an inverse K₁⁺ with WᵀK₁⁺ = 0: forces of rows do not stretch springs.
+    """
+
+    directions: Array  # W, shape (n, k)
+    moved: Array  # N, shape (n, k)
+    stiffness: Array  # D, shape (k,)
+
+    @classmethod
+    def of(
+        cls, modes: Array, R: Array, solve: Callable[[Array], Array], soft: float
+    ) -> Springs | None:
+        """Return them, from candidate modes and K⁺B; None where all D ≥ ``soft``."""
+        U = outside_motions(modes, R)
+        if not U.shape[1]:
+            return None
+        compliance, V = np.linalg.eigh(U.T @ solve(U))
+        if compliance[-1] * soft <= 1.0:
+            return None
+        W, D = U @ V, 1.0 / compliance
+        return cls(W, solve(W) * D, D)
+
+    def without(self, solve: Callable[[Array], Array], b: Array) -> Array:
+        """Return K₁⁺ b, from K⁺, shapes ``(n,)`` or ``(n, q)``."""
+        x = solve(b - self.directions @ (self.moved.T @ b))
+        return np.asarray(x - self.moved @ (self.directions.T @ x))
+
+
 # --- The Block --------------------------------------------------------------------------------
 
 OperatorKind = Literal["pinv", "stiffness", "schur"]
@@ -177,10 +228,12 @@ class Block:
         kernel: R, an orthonormal basis of the kernel of K, shape ``(n, r)``.
         diagonal: Diagonal of K, shape ``(n,)``.
         shares: 1 / number of torn copies of each unknown, shape ``(n,)``.
+        springs: What ``kernel`` and ``solve`` do without, as ``Springs`` says; None: nothing.
     """
 
     kernel: Array
     diagonal: Array
+    springs: Springs | None = None
     # what a kind of subdomain gives
     set_stiffness: Callable[[Any], None]
     multiply: Callable[[Array], Array]

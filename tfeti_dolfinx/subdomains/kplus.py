@@ -31,6 +31,11 @@ class InverseTolerances:
     # softest deformations, which falls with the fourth power in sheets
     fine: float = 1e3
     spread: float = 1e8  # ratio of diagonal entries of K from which on rounding may do so
+    # of the mean of the diagonal, over n^(2/d) for n nodes, which is about what its neighbours hold
+    # a subdomain with: stiffer springs are left in K, and cost no more there
+    soft: float = 0.5
+    # the same in tangents, where forces of springs, which are others in each, are no start
+    weak: float = 0.05
 
 
 TOLERANCES = InverseTolerances()
@@ -83,6 +88,7 @@ class InverseFactory:
     kplus: MakeInverse = regularised  # makes the generalised inverse
     prefix: str = "tfeti_sub_"  # prefix of the factors' PETSc options
     factorizations: int = 0  # of this rank so far
+    soft: float = TOLERANCES.soft  # springs below this are taken out of stiffnesses
 
 
 # --- Causes of indefinite stiffnesses -----------------------------------------------------------

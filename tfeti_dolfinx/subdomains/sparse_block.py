@@ -28,6 +28,7 @@ from tfeti_dolfinx.subdomains.block import (
     TOLERANCES,
     Block,
     OperatorKind,
+    Springs,
     SubdomainData,
     candidate_modes,
     fixing_dofs,
@@ -53,7 +54,9 @@ class Stiffness:
     where a factor could not be made. K is scipy CSR, shape ``(n, n)``, and becomes its own.
 
     Attributes:
-        kernel: R, shape ``(n, r)``.
+        null: The kernel of K, shape ``(n, q)``.
+        kernel: R, shape ``(n, r)``: that, and the motions of springs.
+        springs: The soft ones, if the factory of inverses takes them out; K has them.
         diagonal: Diagonal of K.
         pinv_on: A trace, ascending, on which a dense K⁺ is known, maybe empty, and this.
         entries: Entries of the factor; of an inverse that the user brings, as if it were dense.
@@ -66,11 +69,13 @@ class Stiffness:
         self.size = int(K.shape[0])
         self.bs = self.size // max(len(x), 1)
         self._traced: WeakValueDictionary[bytes, Traced] = WeakValueDictionary()
+        self.springs: Springs | None = None
         self.pinv_on: Any = np.empty(0, dtype=np.int32), np.empty((0, 0))
         centre = x.mean(axis=0)
         length = np.linalg.norm(x - centre, axis=1).max()
         self.diagonal = K.diagonal()
-        self.kernel = R = kernel_of(K, candidate_modes(x, self.bs, centre, length))
+        modes = candidate_modes(x, self.bs, centre, length)
+        self.kernel = self.null = R = kernel_of(K, modes)
         how.factorizations += 1
         fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
@@ -84,9 +89,17 @@ class Stiffness:
             raise InputError(f"{name}: {why_indefinite(K, R, fixing, x, how.prefix)}") from error
         except FactorError as error:
             raise FactorError(f"{name}: {error}") from error
+        if how.soft:
+            soft = how.soft * float(np.mean(self.diagonal)) * len(x) ** (-2.0 / x.shape[1])
+            self.springs = Springs.of(modes, R, self._solve, soft)
+        if self.springs is not None:
+            self.kernel = np.linalg.qr(np.hstack((R, self.springs.moved)))[0]
 
     def solve(self, b: Array) -> Array:
-        """K⁺ b on all unknowns, shapes ``(n,)`` or ``(n, q)``."""
+        """K⁺ b on all unknowns, shapes ``(n,)`` or ``(n, q)``; K₁⁺ b where there are springs."""
+        return self._solve(b) if self.springs is None else self.springs.without(self._solve, b)
+
+    def _solve(self, b: Array) -> Array:
         if b.ndim == 1 or isinstance(self._pinv, CholeskyFactor):
             return self._pinv.solve(b)
         # an inverse that the user brings may know single vectors only
@@ -125,7 +138,8 @@ class Traced:
         rows = np.minimum(np.searchsorted(known, self.trace), len(known) - 1)
         if not np.array_equal(known[rows], self.trace):
             return None
-        if not isinstance(self._of._pinv, CholeskyFactor):  # K_ρ⁻¹, unlike a K⁺ of one's own
+        # K_ρ⁻¹, unlike a K⁺ of one's own, or without springs
+        if not isinstance(self._of._pinv, CholeskyFactor) or self._of.springs is not None:
             return None
         if R.size and np.linalg.svd(R, compute_uv=False)[-1] <= TOLERANCES.on_trace:
             return None
@@ -177,8 +191,8 @@ class Traced:
         if len(inside) == 0 or len(self.trace) == 0:
             return None
         # the triangle has the null space of the kernel's trace rows, and few rows itself
-        triangle = np.linalg.qr(stiffness.kernel[self.trace], mode="r")
-        R = stiffness.kernel[inside] @ null_space(triangle, rcond=TOLERANCES.on_trace)
+        triangle = np.linalg.qr(stiffness.null[self.trace], mode="r")
+        R = stiffness.null[inside] @ null_space(triangle, rcond=TOLERANCES.on_trace)
         how, K_ii = stiffness.how, entries_within(stiffness.K, inside, inside)
         how.factorizations += 1
         try:
@@ -320,6 +334,8 @@ class SparseBlock(Block):
         stiffness, self.place = self._found(K)
         self._stiffness: Stiffness | None = stiffness
         self.diagonal, self.kernel = stiffness.diagonal[self.place], stiffness.kernel[self.place]
+        if (own := stiffness.springs) is not None:
+            self.springs = Springs(own.directions[self.place], own.moved[self.place], own.stiffness)
 
     def _found(self, K: Any) -> tuple[Stiffness, Array]:
         """Return a Stiffness of K, and the place of each unknown in it; boundary elements' else."""

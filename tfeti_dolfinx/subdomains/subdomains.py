@@ -1,4 +1,4 @@
-"""All Blocks of a rank as one, made from the forms, with the soft motions of springs."""
+"""All Blocks of a rank as one, made from the forms."""
 
 from __future__ import annotations
 
@@ -23,7 +23,13 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.block import Block, OperatorKind, RigidBlock, SubdomainData
+from tfeti_dolfinx.subdomains.block import (
+    Block,
+    OperatorKind,
+    RigidBlock,
+    Springs,
+    SubdomainData,
+)
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
@@ -32,37 +38,19 @@ from tfeti_dolfinx.subdomains.local_operators import (
     solves_of,
 )
 
-# --- Motions of subdomains that springs hold --------------------------------------------------
+# --- Tolerances -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class RoundingTolerances:
-    """Tolerances below which motions and loads of subdomains are rounding."""
+    """Tolerances below which loads of subdomains are rounding."""
 
-    in_kernel: float = 1e-6  # part of a mode of length 1 outside of the kernel
     # of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times
     # less was found where it balances itself; more moves the subdomain
     balanced: float = 1e-14
 
 
 TOLERANCES = RoundingTolerances()
-
-
-def _outside_motions(block: Block) -> tuple[Array, Array]:
-    """R̂, orthonormal, orthogonal to the kernel, shape ``(n, k)``, and the diagonal of R̂ᵀKR̂."""
-    modes, R = block.modes, block.kernel
-    count = modes.shape[1] - R.shape[1]
-    if count <= 0:
-        return np.zeros((len(modes), 0)), np.zeros(0)
-    sizes = np.linalg.norm(modes, axis=0)
-    rest = modes / np.where(sizes > 0.0, sizes, 1.0)
-    for _ in range(2):  # once leaves rounding of the kernel
-        rest = rest - R @ (R.T @ rest)
-    U, sizes, _ = np.linalg.svd(rest, full_matrices=False)
-    U = U[:, :count][:, sizes[:count] > TOLERANCES.in_kernel]
-    KU = np.array([block.multiply(u) for u in U.T]).reshape(-1, len(modes)).T
-    energies, V = np.linalg.eigh(U.T @ KU)
-    return U @ V, np.maximum(energies, 0.0)
 
 
 # --- All subdomains of a rank -----------------------------------------------------------------
@@ -86,7 +74,8 @@ class Subdomains:
         size: n.
         load_rounding: What rounding may have made of each entry of the load, shape ``(n,)``.
         trace_parts: Where the trace unknowns of each Block lie among the t, dof_parts its unknowns
-            among the n, and kernel_parts its kernel coordinates among the r.
+            among the n, kernel_parts its kernel coordinates among the r, and spring_parts its
+            springs among the k.
         diagonal: On the trace, the mean of the diagonal of K at each node, shape ``(t,)``.
     """
 
@@ -111,6 +100,7 @@ class Subdomains:
         self.dof_parts = parts_of([len(block.load) for block in self.blocks])
         self.kernel_parts = parts_of([block.kernel.shape[1] for block in self.blocks])
         self.elastic_parts = list(zip(self.elastic, self.dof_parts, strict=False))
+        self.spring_parts = parts_of([0 if s is None else len(s.stiffness) for s in self.springs])
         self.size = sum(len(block.load) for block in self.blocks)
         self.load_rounding: Array = np.zeros(self.size)
         self._read_trace()
@@ -165,6 +155,32 @@ class Subdomains:
         return _assembled(parts, rows, columns, (len(self.trace), sum(p.shape[1] for p in parts)))
 
     @property
+    def springs(self) -> list[Springs | None]:
+        """Those of each Block."""
+        return [getattr(block, "springs", None) for block in self.blocks]
+
+    @property
+    def spring_rows(self) -> csr_array:
+        """√D WᵀR of the springs, shape ``(k, r)``."""
+        found = list(zip(self.blocks, self.springs, strict=True))
+        parts = [
+            np.zeros((0, block.kernel.shape[1]))
+            if own is None
+            else np.sqrt(own.stiffness)[:, None] * (own.directions.T @ block.kernel)
+            for block, own in found
+        ]
+        rows = [part.start for part in self.spring_parts]
+        columns = [part.start for part in self.kernel_parts]
+        shape = sum(map(len, parts)), sum(part.shape[1] for part in parts)
+        return _assembled(parts, rows, columns, shape)
+
+    def spring_motions(self, u: Array) -> Array:
+        """√D Wᵀu of the springs, shape ``(k,)``, for u of shape ``(n,)``."""
+        pairs = zip(self.springs, self.dof_parts, strict=True)
+        found = [(own, u[part]) for own, part in pairs if own is not None]
+        return joined([np.sqrt(own.stiffness) * (own.directions.T @ v) for own, v in found])
+
+    @property
     def kernel_load(self) -> Array:
         """Rᵀ f, shape ``(r,)``; 0 where it is rounding of f, as of stresses that are given."""
         parts = []
@@ -178,19 +194,6 @@ class Subdomains:
         """R α on all unknowns, shape ``(n,)``, for α of shape ``(r,)``."""
         pairs = zip(self.blocks, self.kernel_parts, strict=True)
         return joined([block.kernel @ alpha[part] for block, part in pairs])
-
-    def soft_motions(self) -> tuple[csr_array, Array]:
-        """Return the motions R̂ of Blocks that springs hold: rigid ones that are no kernel.
-
-        On the trace, shape ``(t, k)``, with the diagonal matrix R̂ᵀKR̂, shape ``(k,)``.
-        """
-        found = [_outside_motions(block) for block in self.blocks]
-        pairs = list(zip(self.blocks, found, strict=True))
-        trace = [R[block.trace_dofs] for block, (R, _) in pairs]
-        begins = np.cumsum([0, *(part.shape[1] for part in trace)])
-        rows = [part.start for part in self.trace_parts]
-        of_trace = _assembled(trace, rows, list(begins[:-1]), (len(self.trace), int(begins[-1])))
-        return of_trace, joined([D for _, D in found])
 
     # ------------------------------------------------------- rigid bodies' unknowns
 
