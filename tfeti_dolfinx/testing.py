@@ -235,7 +235,7 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     K, R, trace = K.toarray(), block.kernel, block.trace_dofs
     floating, springs = K, block.springs if hasattr(block, "springs") else None
     if springs is not None:
-        floating = K - (springs.directions * springs.stiffness) @ springs.directions.T
+        floating = K - (springs.stretches * springs.stiffness) @ springs.stretches.T
     n, r, rng = len(K), R.shape[1], np.random.default_rng(0)
     # the kernel
     shapes = [block.load.shape, block.diagonal.shape, block.shares.shape]

@@ -45,7 +45,7 @@ class CoarseSpace(Coarse):
 
     G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
     ``bounded`` are local rows with λ ≥ 0, ``rubbing`` those of friction, ``springs`` those of
-    springs, behind all others: √(D/σ) WᵀR of these, so that F is 1/σ there. Creation and all
+    springs, behind all others: √(D/σ) PᵀR of these, so that F is 1/σ there. Creation and all
     methods but ``spring_ends`` are collective.
 
     Attributes:
@@ -161,7 +161,7 @@ class CoarseSpace(Coarse):
     def spring_ends(self, lam: Array, u: Array) -> Array:
         """Return how far the ends of springs move under λ and u, which rows hold, shape ``(k,)``.
 
-        √(D/σ) Wᵀu − λ/σ, in the length that makes a spring as stiff as a row.
+        √(D/σ) Pᵀu − λ/σ, in the length that makes a spring as stiff as a row.
         """
         stretched = self.subdomains.spring_motions(u) / np.sqrt(self.sigma)
         return np.asarray(stretched - lam[self.springs] / self.sigma)

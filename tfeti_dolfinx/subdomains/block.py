@@ -163,36 +163,37 @@ def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
 
 @dataclass(frozen=True)
 class Springs:
-    """Springs from rigid motions of a subdomain to the ground: K = K₁ + W diag(D) Wᵀ.
+    """Springs from rigid motions of a subdomain to the ground: K = K₁ + P diag(D) Pᵀ.
 
     As a Dirichlet condition is one of rows, so is the far end of a spring: without its springs a
-    subdomain floats, however soft they are. W are orthonormal rigid motions outside of the kernel R
-    of K, and D⁻¹ = WᵀK⁺W is diagonal. With N = K⁺WD the kernel of K₁ is that of R and N, and
-    (I − NWᵀ)K⁺(I − WNᵀ) an inverse K₁⁺ with WᵀK₁⁺ = 0: forces of rows do not stretch springs.
+    subdomain floats, however soft they are. W are orthonormal rigid motions outside of the kernel
+    of K, D = WᵀKW is diagonal, and P = KWD⁻¹. K₁W = 0, and (I − WPᵀ)K⁺(I − PWᵀ) is an inverse K₁⁺
+    with PᵀK₁⁺ = 0: forces of rows do not stretch springs.
     """
 
     directions: Array  # W, shape (n, k)
-    moved: Array  # N, shape (n, k)
+    stretches: Array  # P, shape (n, k)
     stiffness: Array  # D, shape (k,)
 
     @classmethod
     def of(
-        cls, modes: Array, R: Array, solve: Callable[[Array], Array], soft: float
+        cls, modes: Array, R: Array, multiply: Callable[[Array], Array], soft: float
     ) -> Springs | None:
-        """Return them, from candidate modes and K⁺B; None where all D ≥ ``soft``."""
+        """Return them, from candidate modes and K B; None where all D ≥ ``soft``."""
         U = outside_motions(modes, R)
         if not U.shape[1]:
             return None
-        compliance, V = np.linalg.eigh(U.T @ solve(U))
-        if compliance[-1] * soft <= 1.0:
+        D, V = np.linalg.eigh(U.T @ multiply(U))
+        if not 0.0 < D[0] < soft:
             return None
-        W, D = U @ V, 1.0 / compliance
-        return cls(W, solve(W) * D, D)
+        W = U @ V
+        KW = multiply(W)
+        return cls(W, KW @ np.linalg.inv(W.T @ KW), D)  # PᵀW = I, however small D is beside K
 
     def without(self, solve: Callable[[Array], Array], b: Array) -> Array:
         """Return K₁⁺ b, from K⁺, shapes ``(n,)`` or ``(n, q)``."""
-        x = solve(b - self.directions @ (self.moved.T @ b))
-        return np.asarray(x - self.moved @ (self.directions.T @ x))
+        x = solve(b - self.stretches @ (self.directions.T @ b))
+        return np.asarray(x - self.directions @ (self.stretches.T @ x))
 
 
 # --- The Block --------------------------------------------------------------------------------

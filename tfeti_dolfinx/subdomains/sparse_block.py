@@ -91,9 +91,9 @@ class Stiffness:
             raise FactorError(f"{name}: {error}") from error
         if how.soft:
             soft = how.soft * float(np.mean(self.diagonal)) * len(x) ** (-2.0 / x.shape[1])
-            self.springs = Springs.of(modes, R, self._solve, soft)
+            self.springs = Springs.of(modes, R, self.product.__matmul__, soft)
         if self.springs is not None:
-            self.kernel = np.linalg.qr(np.hstack((R, self.springs.moved)))[0]
+            self.kernel = np.hstack((R, self.springs.directions))
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)`` or ``(n, q)``; K₁⁺ b where there are springs."""
@@ -335,7 +335,9 @@ class SparseBlock(Block):
         self._stiffness: Stiffness | None = stiffness
         self.diagonal, self.kernel = stiffness.diagonal[self.place], stiffness.kernel[self.place]
         if (own := stiffness.springs) is not None:
-            self.springs = Springs(own.directions[self.place], own.moved[self.place], own.stiffness)
+            self.springs = Springs(
+                own.directions[self.place], own.stretches[self.place], own.stiffness
+            )
 
     def _found(self, K: Any) -> tuple[Stiffness, Array]:
         """Return a Stiffness of K, and the place of each unknown in it; boundary elements' else."""

@@ -161,12 +161,12 @@ class Subdomains:
 
     @property
     def spring_rows(self) -> csr_array:
-        """√D WᵀR of the springs, shape ``(k, r)``."""
+        """√D PᵀR of the springs, shape ``(k, r)``."""
         found = list(zip(self.blocks, self.springs, strict=True))
         parts = [
             np.zeros((0, block.kernel.shape[1]))
             if own is None
-            else np.sqrt(own.stiffness)[:, None] * (own.directions.T @ block.kernel)
+            else np.sqrt(own.stiffness)[:, None] * (own.stretches.T @ block.kernel)
             for block, own in found
         ]
         rows = [part.start for part in self.spring_parts]
@@ -175,10 +175,10 @@ class Subdomains:
         return _assembled(parts, rows, columns, shape)
 
     def spring_motions(self, u: Array) -> Array:
-        """√D Wᵀu of the springs, shape ``(k,)``, for u of shape ``(n,)``."""
+        """√D Pᵀu of the springs, shape ``(k,)``, for u of shape ``(n,)``."""
         pairs = zip(self.springs, self.dof_parts, strict=True)
         found = [(own, u[part]) for own, part in pairs if own is not None]
-        return joined([np.sqrt(own.stiffness) * (own.directions.T @ v) for own, v in found])
+        return joined([np.sqrt(own.stiffness) * (own.stretches.T @ v) for own, v in found])
 
     @property
     def kernel_load(self) -> Array:
