@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from test_discs import discs
 
 from tfeti_dolfinx import InputError
@@ -15,21 +13,15 @@ from tfeti_dolfinx.testing import check_feasible_set
 
 pytestmark = pytest.mark.usefixtures("serial_only")
 
+LOWER = Bounds(np.linspace(-2.0, 2.0, 17))
+
 
 @pytest.mark.parametrize(
     "feasible",
-    [Bounds(), Product(), Product([(slice(3, 20), Bounds())]), Product([(slice(0, 0), Bounds())])],
+    [Bounds(), Product(), Product([(slice(3, 20), LOWER)]), Product([(slice(0, 0), Bounds())])],
 )
 def test_feasible_sets_fulfil_their_contract(feasible):
     check_feasible_set(feasible, 30)
-
-
-@given(st.integers(0, 10_000), st.floats(-2, 2))
-def test_bounds_fulfil_their_contract_for_any_bound(seed, level):
-    rng = np.random.default_rng(seed)
-    where = np.flatnonzero(rng.random(12) < 0.5)
-    lower = level + rng.standard_normal(len(where))
-    check_feasible_set(Product([(where, Bounds(lower))]), 12, seed)
 
 
 def friction(seed=0):

@@ -17,9 +17,9 @@ from tfeti_dolfinx.common.arrays import Array, joined, parts_of
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.subdomains.block import TOLERANCES as ROUNDING
 from tfeti_dolfinx.subdomains.block import OperatorKind, candidate_modes, outside_motions
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
-from tfeti_dolfinx.subdomains.subdomains import TOLERANCES as ROUNDING
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Clusters of subdomains and averages over their faces -------------------------------------

@@ -49,7 +49,7 @@ class SubdomainData:
 
 @dataclass(frozen=True)
 class KernelTolerances:
-    """Tolerances of kernels and fixing nodes."""
+    """Tolerances of kernels, fixing nodes and loads on kernels."""
 
     # energy of a mode, over what its terms may be without their signs, that counts as none:
     # rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more
@@ -66,6 +66,9 @@ class KernelTolerances:
     # inverse, S, are rounding of stiff ones; with cells of moduli 1 : 1e6 1e-8 was too little
     invertible: float = 1e-6
     in_kernel: float = 1e-6  # part of a mode of length 1 outside of the kernel that is rounding
+    # of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times
+    # less was found where it balances itself; more moves the subdomain
+    balanced: float = 1e-14
 
 
 TOLERANCES = KernelTolerances()

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, Entries, plus
-from tfeti_dolfinx.subdomains.block import candidate_modes
+from tfeti_dolfinx.subdomains.block import candidate_modes, outside_motions
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
 # --- K⁺ -----------------------------------------------------------------------------------------
@@ -25,8 +25,6 @@ class InverseTolerances:
     # of the diagonal: what this makes positive definite was indefinite by rounding only, which in
     # assembly and factor comes to 1e-14 or so
     rounding: float = 1e-12
-    # energy of a motion, over that of its entries alone, that counts as none
-    no_energy: float = 1e-10
     # length of a subdomain over its shortest edge from which on rounding may hide the energy of its
     # softest deformations, which falls with the fourth power in sheets
     fine: float = 1e3
@@ -125,7 +123,8 @@ def gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool
 
     Pivots that should be 0 are positive where rounding makes them so. It takes one solve.
     """
-    R = _with_weakly_held(K, R, x)
+    modes = candidate_modes(x, K.shape[0] // len(x), x.mean(axis=0), 1.0)
+    R = np.hstack((R, outside_motions(modes, R)))  # springs may hold those by little
     force = _beside(R, _noise(K.shape[0]))
     u = _beside(R, inverse.solve(force))
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
@@ -143,20 +142,6 @@ def gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool
 @lru_cache(64)
 def _noise(size: int) -> Array:
     return np.random.default_rng(0).standard_normal(size)
-
-
-def _with_weakly_held(K: Any, R: Array, x: Array) -> Array:
-    """Return an orthonormal basis of the kernel and of rigid motions that weak springs hold."""
-    bs = K.shape[0] // len(x)
-    if R.shape[1] == candidate_modes(x[:1], bs, x[0], 1.0).shape[1]:
-        return R
-    modes = candidate_modes(x, bs, x.mean(axis=0), float(np.linalg.norm(np.ptp(x, axis=0))))
-    U, s, _ = np.linalg.svd(_beside(R, modes), full_matrices=False)
-    U = U[:, s > TOLERANCES.still * np.linalg.norm(modes, axis=0).max()]
-    energies, turn = np.linalg.eigh(U.T @ (K @ U))
-    U = U @ turn
-    own = np.sum(U**2 * K.diagonal()[:, None], axis=0)
-    return np.hstack((R, U[:, np.abs(energies) <= TOLERANCES.no_energy * own]))
 
 
 def _beside(R: Array, u: Array) -> Array:

@@ -180,25 +180,6 @@ def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
     return out
 
 
-def solves_of(
-    blocks: Sequence[Block], parts: Sequence[slice]
-) -> list[tuple[Callable[[Array], Array], Array]]:
-    """K⁺ of all Blocks with its unknowns among the rank's, a column for each of equal ones."""
-    found: list[tuple[Callable[[Array], Array], Array]] = []
-    members: dict[int, list[tuple[SparseBlock, Array]]] = defaultdict(list)
-    for block, part in zip(blocks, parts, strict=True):
-        dofs = np.arange(part.start, part.stop)
-        if isinstance(block, SparseBlock):
-            members[id(block.stiffness)].append((block, dofs[np.argsort(block.place)]))
-        else:
-            found.append((block.solve, dofs))
-    for equal in members.values():
-        solve = partial(_in_chunks, equal[0][0].stiffness.solve)
-        columns = [dofs for _, dofs in equal]
-        found.append((solve, np.stack(columns, axis=1) if len(columns) > 1 else columns[0]))
-    return found
-
-
 # --- Local operators of all subdomains of a rank ----------------------------------------------
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -24,6 +23,7 @@ from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import (
+    TOLERANCES,
     Block,
     OperatorKind,
     RigidBlock,
@@ -35,23 +35,7 @@ from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
     LocalChoice,
     LocalOperator,
-    solves_of,
 )
-
-# --- Tolerances -------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class RoundingTolerances:
-    """Tolerances below which loads of subdomains are rounding."""
-
-    # of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times
-    # less was found where it balances itself; more moves the subdomain
-    balanced: float = 1e-14
-
-
-TOLERANCES = RoundingTolerances()
-
 
 # --- All subdomains of a rank -----------------------------------------------------------------
 
@@ -105,7 +89,6 @@ class Subdomains:
         self.load_rounding: Array = np.zeros(self.size)
         self._read_trace()
         self._pinv_load: Array | None = None
-        self._solves: list[tuple[Callable[[Array], Array], Array]] | None = None
 
     def _read_trace(self) -> None:
         traces = [block.trace_dofs for block in self.blocks]
@@ -261,11 +244,10 @@ class Subdomains:
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shape ``(n,)``."""
-        if self._solves is None:
-            self._solves = solves_of(self.blocks, self.dof_parts)
-        x = np.empty(len(b))
-        for solve, dofs in self._solves:
-            x[dofs] = solve(b[dofs]) if b[dofs].any() else 0.0  # most bear no load of their own
+        x = np.zeros(len(b))
+        for block, part in zip(self.blocks, self.dof_parts, strict=True):
+            if b[part].any():  # most bear no load of their own
+                x[part] = block.solve(b[part])
         return x
 
     @property
