@@ -174,6 +174,17 @@ def multipliers_at(
     return mu if left <= unfelt**2 * size else 0.0 * mu
 
 
+def seen_norm(qp: QP, z: Point, short: float = NewtonParameters.short) -> float:
+    """Return the larger Rayleigh quotient of F at λ, which alone may be far below ‖F‖, and at Pg.
+
+    Multiply once, unless Pg is shorter than the share ``short`` of g. Collective.
+    """
+    p = qp.coarse.project(z.g)
+    energy, size, pp, gg = qp.dot((z.lam, z.g + qp.d), (z.lam, z.lam), (p, p), (z.g, z.g))
+    norm = energy / size if size > 0.0 else 0.0
+    return max(norm, qp.dot((p, qp.F(p)))[0] / pp) if pp > short**2 * gg else norm
+
+
 # --- State of the iteration -------------------------------------------------------------------
 
 
@@ -208,15 +219,9 @@ class NewtonIteration:
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
-        qp, normal, z, seen = self.qp, self.coarse.combined, self.z, self.solver.directions.seen
-        if self.solver.directions.norm == 0.0:
-            # Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at Ps
-            p = self.coarse.project(z.g)
-            energy, size, pp, gg = qp.dot((z.lam, z.g + qp.d), (z.lam, z.lam), (p, p), (z.g, z.g))
-            seen(energy, size)
-            if pp > self.parameters.short**2 * gg:
-                seen(qp.dot((p, qp.F(p)))[0], pp)
-        self.norm = self.solver.directions.norm or 1.0
+        qp, normal, z, directions = self.qp, self.coarse.combined, self.z, self.solver.directions
+        directions.norm = directions.norm or seen_norm(qp, z, self.parameters.short)
+        self.norm = directions.norm or 1.0
         if self.resume:
             self.mu = multipliers_at(qp, z, self.solver.coarse, self.parameters.unfelt)
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large

@@ -21,7 +21,7 @@ from tfeti_dolfinx.qp.friction_newton import (
     LawProgram,
     newton_on_law,
 )
-from tfeti_dolfinx.qp.newton import growth, multipliers_at
+from tfeti_dolfinx.qp.newton import growth, multipliers_at, seen_norm
 from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, Point, QPResult, Steps
 from tfeti_dolfinx.solve.solver import solve_dual
 
@@ -113,8 +113,9 @@ def solve_with_friction(
             rtol = least if near else max(least, min(rtol, parameters.share * change))
         asked = rtol if law is None else least
         exact = goal if asked <= least else None
-        most = options.max_it if law is None else min(options.max_it, parameters.confirming)
-        limited = replace(options, max_it=most)
+        # how exact the first of the law has to be a look tells
+        most = parameters.confirming if aim < np.inf else 0
+        limited = replace(options, max_it=min(options.max_it, most)) if law else options
         result, rule = solve_dual(
             dual, limited, qp_type, law or start, monitor, exact, make_rule, rtol=asked
         )
@@ -123,7 +124,8 @@ def solve_with_friction(
         if result.reason <= 0:
             if law is None and not bounds.turn(result.reason):
                 break
-            law = law and newton.go_on(law, bounds, result.reason, reached)
+            law = law and newton.go_on(law, bounds, result.reason, reached, aim == np.inf)
+            aim = reached
             if not law and (motion := bounds.hold()) is not None:
                 break
             continue
@@ -346,15 +348,23 @@ class NewtonOnLaw:
         self._rests = not any_rank(dual.coarse.comm, other)
 
     def go_on(
-        self, law: tuple[Array, Array], bounds: FrictionBounds, reason: ConvergedReason, aim: float
+        self,
+        law: tuple[Array, Array],
+        bounds: FrictionBounds,
+        reason: ConvergedReason,
+        aim: float,
+        first: bool,
     ) -> tuple[Array, Array] | None:
-        """Go on from an answer whose problem wants more digits than it has itself, or go back.
+        """Go on from an answer that wants more digits, or go back.
 
-        Where friction lets a body slide, the law tells its place better than given bounds do. Else
-        bounds become those before the answer, and Newton's method is tried no more.
+        It is the first one, or its problem wants more than it has itself: where friction lets a
+        body slide, the law tells its place better than given bounds do. Else bounds become those
+        before the answer, and Newton's method is tried no more.
         """
-        before, rounding = bounds.before, reason == ConvergedReason.DIVERGED_ROUNDING
-        again = self.solve(law, bounds, aim) if rounding else None
+        wants = reason == ConvergedReason.DIVERGED_ROUNDING
+        wants |= first and reason == ConvergedReason.DIVERGED_ITS
+        before = bounds.before
+        again = self.solve(law, bounds, aim) if wants else None
         if again is None:
             self.tries, self._dual.recycled, bounds.now = 0, self.recycled, before
         bounds.before = before
@@ -366,11 +376,10 @@ class NewtonOnLaw:
         """Find λ, on this rank's rows, and multipliers of Gλ = e for which the law holds.
 
         ``bounds`` become those of λ; ``aim`` is what residual an answer must have to be right, as
-        far as a look has told. None where it fails, or is not tried: without a start, or a solve
-        that has seen F.
+        far as a look has told. None where it fails, or is not tried, as without a start.
         """
-        dual, parameters, norm = self._dual, self._parameters, self._dual.seen
-        if start is None or self.tries == 0 or norm == 0.0 or bounds.stick:
+        dual, parameters = self._dual, self._parameters
+        if start is None or self.tries == 0 or bounds.stick:
             return None
         if self._rests:  # the same load again: the last bounds are right
             self._rests = False
@@ -380,9 +389,12 @@ class NewtonOnLaw:
         qp, rows, at = dual.qp(), dual.constraints, dual.constraints.pressed
         normals, tangents = rows.pressed_by[at], rows.sets.tangents[at]
         law = Law(lambda known: dual.law(rows.with_pressures(known)), normals, tangents)
-        program = LawProgram(qp, law, dual.coarse.oblique, norm)
         # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
         Fx = dual.last.image(qp.F, qp.coarse.comm, start[0]).Fx
+        dual.seen = dual.seen or seen_norm(qp, Point(start[0], Fx - qp.d))
+        if (norm := dual.seen) == 0.0:
+            return None
+        program = LawProgram(qp, law, dual.coarse.oblique, norm)
         points = []
         for c in dict.fromkeys((1.0, growth(qp.coarse, start[0]))):
             z = Point(c * start[0], c * Fx - qp.d)

@@ -137,7 +137,7 @@ def solve_dual(
         dual.last.looked = state.lam, state.residual
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
-    if result.reason <= 0:
+    if result.reason <= 0 and (options.max_it > 0 or rule.looks == 0):  # else a look was all
         rule.examine_stopped(result)
     return result, rule
 
