@@ -208,24 +208,6 @@ def test_user_pages_are_short():
     assert not [path for path, words in bounds.items() if len(prose(path).split()) > words]
 
 
-def anchors(path):
-    """Names by which links reach the headings of a page."""
-    text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
-    heads = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
-
-
-def test_links_lead_somewhere():
-    """To files, and to headings in them."""
-    for path in [*DOCUMENTS, ROOT / "CONTRIBUTING.md", ROOT / "environment/README.md"]:
-        for target, anchor in re.findall(r"\]\(([^)#]*)(#[^)]*)?\)", path.read_text()):
-            if target.startswith("http"):
-                continue
-            page = path.parent / target if target else path
-            assert page.exists(), f"{path.name}: {target}"
-            assert not anchor or anchor[1:] in anchors(page), f"{path.name}: {target}{anchor}"
-
-
 @pytest.mark.parametrize(
     ("folder", "page"), [("demos", "gallery"), ("benchmarks", "developers/benchmarks")]
 )

@@ -42,7 +42,7 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
         raise InputError(f"stress(u) is {shown(sigma)}; expected a UFL tensor of shape (3, 3)")
     if sigma.ufl_shape != (3, 3):
         raise InputError(
-            f"stress(u) has shape {sigma.ufl_shape}; expected (3, 3), in plane strain with σ_zz"
+            f"stress(u) has shape {sigma.ufl_shape}; expected (3, 3): σ_zz, too, 0 in plane stress"
         )
     return sigma
 
