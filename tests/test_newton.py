@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from reference.untorn import check_optimal
-from scipy.sparse import block_diag, csr_array, diags_array
 from test_newton_discs import solved
 from test_qp import bounds_on, matrix, vector
 
@@ -101,26 +100,6 @@ def test_rows_that_exclude_each_other_are_named(room, solvable):
         assert result.reason > 0
         assert result.lam == pytest.approx([1.0, 0.0, 1.0], abs=1e-9)
         assert result.excluding.size == 0
-
-
-def string_beside(force, n=1500):
-    """A string whose ‖r‖ is not below that at the start for 1000 steps, and a known force."""
-    A = diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
-    F = csr_array(block_diag((A, 1.0)))
-    G, d = np.eye(1, n + 1, n), np.append(np.arange(n) / n, force)
-    return QP(F.__matmul__, vector(d), DenseCoarse(G, np.array([force])), Product())
-
-
-@pytest.mark.parametrize(
-    ("force", "reason"),
-    [pytest.param(1.0, "CONVERGED_RTOL", marks=pytest.mark.slow), (1e15, "DIVERGED_ROUNDING")],
-)
-def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
-    """500 steps, and 500 with a new gradient; beside 1e30, what they gain is rounding of q."""
-    qp = string_beside(force)
-    result = solve_by_pcpg(qp, homogenise(qp), StoppingRule(1e-9))
-    assert result.reason.name == reason
-    assert (result.steps.cg <= 1001) == (force > 1.0)
 
 
 def test_the_first_point_is_feasible_where_0_is_inside():

@@ -72,12 +72,6 @@ class PcpgParameters:
     # less is rounding, as where rows depend on each other
     flat: float = 1e-13
     numbers: int = 24_000_000  # what a rank keeps of directions at most: 192 MB
-    # so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its
-    # rounding have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as
-    # many as there are rows, and a few, have it too
-    plateau: int = 500
-    few: int = 20  # those
-    rounding: float = 1e-15  # of the terms of q
     # of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else conjugate
     # gradients begin anew
     drifted: float = 0.5
@@ -119,33 +113,6 @@ class Directions:
         return pFp > DEFAULT.flat * self.norm * pp
 
 
-# --- Detection of stagnation ------------------------------------------------------------------
-
-
-@dataclass
-class Progress:
-    """Tells when neither residuals nor q have decreased for long."""
-
-    best: float  # the last ‖r‖ that was half of the one before
-    most: int  # steps since then that are long
-    steps: int = 0  # steps since then, and gain how much lower q is
-    gain: float = 0.0
-
-    def step(self, norm: float, gain: float) -> None:
-        """Record a step that lowers q by ``gain`` and ends with ‖r‖ = ``norm``."""
-        self.steps, self.gain = self.steps + 1, self.gain + gain
-        if norm <= 0.5 * self.best:
-            self.best, self.steps, self.gain = norm, 0, 0.0
-
-    def stagnates(self, qp: QP, point: Point) -> bool:
-        """Return whether nothing has decreased for long. Collective if many steps were made."""
-        if self.steps < self.most:
-            return False
-        work, load = qp.dot((point.lam, point.g), (point.lam, qp.d))
-        gain, self.steps, self.gain = self.gain, 0, 0.0
-        return bcast_from_root(qp.coarse.comm, gain <= DEFAULT.rounding * (abs(work) + abs(load)))
-
-
 # --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
 
 
@@ -172,7 +139,6 @@ def pcpg(
     the rule's                   ‖P g‖ ≤ ``rule.tolerance``, and the rule is content
     ``DIVERGED_ITS``             ``max_it`` steps are not enough
     ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
-    ``DIVERGED_ROUNDING``        neither ‖P g‖ nor q has come down for long
     ===========================  ===================================================
 
     ``directions``, which are updated, are what an earlier call at this point with this ``qp`` has
@@ -182,14 +148,10 @@ def pcpg(
     recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
     least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
-    rows = int(summed(comm, np.array([len(qp.d)]))[0])
-    progress = Progress(norm, min(DEFAULT.plateau, 2 * rows + DEFAULT.few))
     while True:
         # test
         small = norm <= rule.tolerance
         reason = _examined(qp, point, rule, norm) if small else ConvergedReason.ITERATING
-        if reason == ConvergedReason.ITERATING and progress.stagnates(qp, point):
-            reason = ConvergedReason.DIVERGED_ROUNDING
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -227,7 +189,6 @@ def pcpg(
         own.r = left
         own.fresh, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
         steps.cg += 1
-        progress.step(norm, 0.5 * rp**2 / pFp)
         monitor(steps, "cg", point.lam, norm, 0.0)
     for direction in new:
         recycled.add(*direction)  # type: ignore[union-attr]
