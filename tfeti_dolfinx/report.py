@@ -246,7 +246,7 @@ class Outcome:
             contacts=ContactSummary.of_solution(solution),
             clusters=dual.subdomains.num_clusters,
             kernel_dim=dual.coarse.dimension,
-            soft_modes=dual.coarse.num_springs if dual.deflation is None else dual.deflation.count,
+            soft_modes=(dual.deflation.count if dual.deflation else dual.subdomains.num_springs),
             free_modes=dual.coarse.free_motions.count,
             nearly_free=nearly_free,
             excluding_contacts=excluding,

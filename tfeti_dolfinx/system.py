@@ -491,8 +491,9 @@ class System:
             np.arange(len(self.subdomains.blocks)),
             [part.stop - part.start for part in self.subdomains.spring_parts],
         )
-        constraints = self.gluing.constraints.with_springs(of_springs)
-        if constraints is not self.gluing.constraints:
+        before = self.gluing.constraints
+        if (constraints := before.with_springs(of_springs)) is not before:
+            before.B.destroy()
             self._gluing = replace(self.gluing, constraints=constraints)
         self._dual = self._settings.make_dual(
             self.gluing.constraints, self.subdomains, self._dofs, law, names

@@ -233,7 +233,7 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     missing = [name for name in PROMISED if not hasattr(block, name)]
     require(not missing, f"a Block has {', '.join(missing)}")
     K, R, trace = K.toarray(), block.kernel, block.trace_dofs
-    floating, springs = K, block.springs if hasattr(block, "springs") else None
+    floating, springs = K, block.springs
     if springs is not None:
         floating = K - (springs.stretches * springs.stiffness) @ springs.stretches.T
     n, r, rng = len(K), R.shape[1], np.random.default_rng(0)

@@ -162,7 +162,7 @@ class Constraints:
     def with_springs(self, subdomain: Array) -> Constraints:
         """Return rows with those of springs, each of a subdomain of this rank, behind the others.
 
-        B, which the rows come with, is destroyed where they are other ones. Collective.
+        These rows where they are so, else others, with a B of their own. Collective.
         """
         comm, sets = self.B.getComm().tompi4py(), self.sets
         if not any_rank(comm, not np.array_equal(subdomain, sets.springs_of)):
@@ -172,7 +172,6 @@ class Constraints:
         table = np.append(indptr[: rows + 1], np.full(count, indptr[-1], dtype=indptr.dtype))
         size = ((rows + count, None), (self.B.getLocalSize()[1], None))
         B = PETSc.Mat().createAIJ(size=size, csr=(table, indices, data), comm=self.B.getComm())
-        self.B.destroy()
         c = np.append(self.c[:rows], np.zeros(count))
         sets = replace(sets, springs=rows + np.arange(count), springs_of=subdomain)
         return replace(self, B=B, c=c, sets=sets)

@@ -15,7 +15,6 @@ from tfeti_dolfinx.common.parallel import (
     bcast_from_root,
     chunk_offsets,
     joined_over,
-    summed,
 )
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
@@ -85,7 +84,6 @@ class CoarseSpace(Coarse):
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         Gt = transposed_G(B, kernel, dimension)
         self.springs, self.sigma = springs, sigma
-        self.num_springs = int(summed(comm, np.array([len(springs)]))[0])
         per_spring = csr_array(subdomains.spring_rows / np.sqrt(sigma))
         if len(springs):  # behind all others
             place = (per_spring.data, self._own.start + per_spring.indices, per_spring.indptr)
@@ -103,7 +101,7 @@ class CoarseSpace(Coarse):
         self.unheld = self._unglued = self.unresisted(equalities, self.bodies.unsprung)
         glues = np.array(equalities)
         glues[springs] = False
-        if self.num_springs:
+        if subdomains.num_springs:
             self._unglued = self.unresisted(glues, self.bodies.unsprung)
         self.free_motions = self.unresisted(~equalities)
         both = self.free_motions.columns

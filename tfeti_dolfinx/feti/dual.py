@@ -163,7 +163,7 @@ class Dual:
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
         springs, sigma = constraints.sets.springs, 1.0
-        if not any_rank(comm, any(own is not None for own in subdomains.springs)):
+        if not subdomains.num_springs:
             springs = springs[:0]
         else:
             sigma = mean_stiffness(subdomains, constraints.weights)
@@ -301,7 +301,7 @@ class Dual:
             recycled=self.recycled,
             keeps="kept_directions" not in self._without,
             cautious="cautious" not in self._without,
-            sprung=self.coarse.num_springs > 0,
+            sprung=self.subdomains.num_springs > 0,
             foundation=None if "foundation" in self._without else self.foundation,
         )
 

@@ -204,7 +204,7 @@ class Springs:
 OperatorKind = Literal["pinv", "stiffness", "schur"]
 # what the dual knows of a Block
 PROMISED: tuple[str, ...] = (
-    *("load", "kernel", "diagonal", "trace_dofs", "modes", "shares", "bs"),
+    *("load", "kernel", "springs", "diagonal", "trace_dofs", "modes", "shares", "bs"),
     *("multiply", "solve", "apply_pinv", "apply_stiffness", "apply_schur", "prepare"),
     *("update", "retrace", "destroy"),
 )

@@ -51,7 +51,7 @@ class Subdomains:
     Attributes:
         elastic: The Blocks that have nodes, which are no rigid bodies, and num_nodal the number of
             their unknowns; those behind are of rigid bodies.
-        num_modes: k; num_clusters: clusters on all ranks, 0 without.
+        num_modes: k; num_springs and num_clusters: springs and clusters on all ranks.
         tangents: Whether stiffnesses are tangents of nonlinear materials.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         elastic_parts: Each of the Blocks that have nodes, with its part of the n unknowns.
@@ -81,10 +81,12 @@ class Subdomains:
         self.num_bodies, self.comm = num_bodies, comm
         own = max((block.modes.shape[1] for block in self.blocks), default=0)
         self.num_modes = int(comm.allreduce(own, op=MPI.MAX))
+        of_springs = [0 if own is None else len(own.stiffness) for own in self.springs]
+        self.spring_parts = parts_of(of_springs)
+        self.num_springs = int(comm.allreduce(sum(of_springs)))
         self.dof_parts = parts_of([len(block.load) for block in self.blocks])
         self.kernel_parts = parts_of([block.kernel.shape[1] for block in self.blocks])
         self.elastic_parts = list(zip(self.elastic, self.dof_parts, strict=False))
-        self.spring_parts = parts_of([0 if s is None else len(s.stiffness) for s in self.springs])
         self.size = sum(len(block.load) for block in self.blocks)
         self.load_rounding: Array = np.zeros(self.size)
         self._read_trace()
@@ -140,7 +142,7 @@ class Subdomains:
     @property
     def springs(self) -> list[Springs | None]:
         """Those of each Block."""
-        return [getattr(block, "springs", None) for block in self.blocks]
+        return [block.springs for block in self.blocks]
 
     @property
     def spring_rows(self) -> csr_array:
