@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
+from petsc4py import PETSc
 from test_solvable_lp import dual_of
 
 
@@ -28,6 +29,15 @@ def applied(p, u):
 
 def num_dofs(p):
     return p.dofs.num_nodes * p.dofs.bs
+
+
+def test_stiffnesses_are_on_the_arrays_of_petsc_and_hold_their_kernels_once(scene):
+    _, subdomains = scene
+    firsts = {id(block.stiffness): block for block in reversed(subdomains.elastic)}
+    for block in firsts.values():
+        K = block.stiffness.K
+        assert K.indices.dtype == K.indptr.dtype == PETSc.IntType
+        assert np.shares_memory(block.kernel, block.stiffness.kernel)
 
 
 def test_energies(scene):

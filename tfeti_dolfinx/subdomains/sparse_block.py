@@ -333,7 +333,9 @@ class SparseBlock(Block):
         """Take a stiffness."""
         stiffness, self.place = self._found(K)
         self._stiffness: Stiffness | None = stiffness
-        self.diagonal, self.kernel = stiffness.diagonal[self.place], stiffness.kernel[self.place]
+        # the first of equal ones has the arrays of the stiffness themselves
+        here = slice(None) if stiffness.x is self.x else self.place
+        self.diagonal, self.kernel = stiffness.diagonal[here], stiffness.kernel[here]
         if (own := stiffness.springs) is not None:
             self.springs = Springs(
                 own.directions[self.place], own.stretches[self.place], own.stiffness

@@ -405,6 +405,7 @@ def subdomain_stiffness(K: Any, rows: Array, primal: Array, first: int) -> csr_a
     """Stiffness of one subdomain, in primal order."""
     entries, table = entries_of_rows(K, rows)
     columns = primal[K.indices[entries]] - first
-    A = csr_array((K.data[entries], columns, table), shape=(len(rows),) * 2)
+    # of the type of columns, on whose arrays PETSc's matrix of it is then
+    A = csr_array((K.data[entries], columns, table.astype(columns.dtype)), shape=(len(rows),) * 2)
     A.sort_indices()
     return A
