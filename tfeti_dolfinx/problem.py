@@ -31,7 +31,6 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts,
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.recovery import nearest
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import check_mesh, check_ring, check_same_space, displacement_space
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
@@ -149,9 +148,9 @@ class ContactProblem:
         self._in_all: dict[str, float] = {}
         self._logged: set[str] = set()  # warnings
         self._solution: Solution | None = None
+        # flags of the bodies that move freely in the last solution, if contact has held some
+        self._let_go: Array = np.zeros(0, dtype=bool)
         self._start: Start | None = None
-        # in primal order, what free motions count from; None: from no displacement
-        self._near: Array | None = None
         self._accepted: tuple[Solution | None, Start | None] = (None, None)
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
@@ -271,6 +270,7 @@ class ContactProblem:
         now = self.options
         options = replace(system.options, rtol=now.rtol, atol=now.atol, warnings=now.warnings)
         dual.forget_counts()
+        dual.begin = system.begun()
         # 1. the multipliers
         with stage("solve", seconds):
             start = None
@@ -294,12 +294,8 @@ class ContactProblem:
             multipliers = Multipliers(result.lam.copy(), result.face)
             nodal = dual.subdomains.num_nodal
             system.tools.take(accuracy.u[nodal:])
-            u = accuracy.u
-            if self._near is not None and accuracy.recovered is not None:
-                near = np.concatenate((self._near, u[nodal:]))
-                u = nearest(dual.coarse, accuracy.recovered, near)
-            u = u[:nodal]
-            solution = self._solution = self._make_solution(u, multipliers, gluing)
+            solution = self._make_solution(accuracy.u[:nodal], multipliers, gluing)
+            self._solution = solution
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         end = gluing, solution.lam, result.mu, system.inverses
         self._start = end if result.reason > 0 else None
@@ -309,8 +305,11 @@ class ContactProblem:
         contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
         excluding = system.search.named(contacts)
         state, loose = accuracy.recovered, list[dict[str, Any]]()
+        self._let_go = np.zeros(0, dtype=bool)
+        if state is not None and state.loose.count > dual.coarse.free_motions.count:
+            self._let_go = state.loose.moving
         if options.warnings and state is not None:
-            loose = dual.nearly_free(state.active)
+            loose = dual.nearly_free(state.loose)
         looks = of_looks(accuracy.reached)
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, looks, loose)
         warnings = list[str]()

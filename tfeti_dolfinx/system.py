@@ -328,6 +328,11 @@ class System:
         elif self._gluing is not None:
             self._gluing = replace(self._gluing, slip=self._slip())
 
+    def begun(self) -> Array:
+        """Return where the load step began, with free motions of rigid bodies, shape ``(n,)``."""
+        rest = np.zeros(self.subdomains.num_nodal) if self._rest is None else self._rest
+        return np.append(rest, self.tools.at_begin()[: self.tools.num_local])
+
     def know_rows(
         self, reach: Sequence[float], groups: Sequence[Array], secondary: Sequence[int]
     ) -> None:

@@ -374,5 +374,5 @@ def _free(outcome: Outcome) -> list[str]:
     are, them = ("s are", "them") if outcome.free_modes > 1 else (" is", "it")
     return [
         f"{outcome.free_modes} rigid motion{are} free{listed}: nothing resists or drives {them}, "
-        "the smallest displacement was taken"
+        "the displacement nearest to that where the load step began was taken"
     ]

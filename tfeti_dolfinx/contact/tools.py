@@ -164,13 +164,14 @@ class Tools:
         if motions is not None:
             both = zip(self.begin, motions.reshape(self.law.shape), strict=True)
             self.begin = [replace(pose, motion=motion) for pose, motion in both]
-        began, placed = (
-            np.array([pose.motion for pose in poses]).reshape(self.law.shape)
-            for poses in (self.begin, self.poses)
-        )
-        at = self.tool, self.mode
         self.found[:] = 0.0
-        self.found[at] = began[at] - placed[at]
+        self.found[self.tool, self.mode] = self.at_begin() / self.scale
+
+    def at_begin(self) -> Array:
+        """Return the unknowns where the load step began, shape ``(num_unknowns,)``."""
+        both = [[pose.motion for pose in poses] for poses in (self.begin, self.poses)]
+        began, placed = np.array(both).reshape(2, *self.law.shape)
+        return np.asarray(self.scale * (began - placed)[self.tool, self.mode])
 
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""

@@ -60,7 +60,6 @@ class CoarseSpace(Coarse):
         unheld: Motions that neither springs nor equality rows resist, friction apart; each of
             these rows acts on one body.
         free_motions: Motions that no row resists at all.
-        free_basis: An orthonormal basis of them, scipy CSR, shape ``(bodies * k, c)``.
         null: Orthonormal basis of null(Gᵀ), scipy CSR, shape ``(r, c)``.
         grams: GGᵀ, and those of faces.
         factors: Makes the factors of faces, and counts them apart from that of GGᵀ, ``factor``.
@@ -105,7 +104,6 @@ class CoarseSpace(Coarse):
             self._unglued = self.unresisted(glues, self.bodies.unsprung)
         self.free_motions = self.unresisted(~equalities)
         both = self.free_motions.columns
-        self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
         # made on one rank: processors that round differently might choose differently
         self._basis = bcast_from_root(
             comm, kernel_basis(self.bodies, self._unglued, self.free_motions)
@@ -199,15 +197,12 @@ class CoarseSpace(Coarse):
         self.factors.count += int(self.dimension > 0)
         return ObliqueProjectors(self.grams, self.rows, face, C, self.factors.null)
 
-    def unresisted(
-        self, rows: Array, within: Motions | None = None, below: float = TOLERANCES.null
-    ) -> Motions:
+    def unresisted(self, rows: Array, within: Motions | None = None) -> Motions:
         """Return motions of a space that rows do not resist.
 
         The null space of Gᵀ lives on the bodies' motions: one that no gluing row resists is the
         same in all subdomains of a body. Found on one rank: processors that round differently might
-        count differently. ``rows`` are flags of local rows, the space is by default ``unheld``,
-        ``below`` as of ``rigid_bodies.unresisted``.
+        count differently. ``rows`` are flags of local rows, the space is by default ``unheld``.
         """
         space = within or self.unheld
         if not space.free.any():
@@ -216,7 +211,7 @@ class CoarseSpace(Coarse):
         found: Any = None
         with raised_on_all_ranks(self.comm):
             if grams is not None:
-                found = unresisted(grams, space, below)
+                found = unresisted(grams, space)
         return cast(Motions, bcast_from_root(self.comm, found))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,7 +26,7 @@ from tfeti_dolfinx.feti.operator import (
 )
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.projectors import FaceFactors
-from tfeti_dolfinx.feti.rigid_bodies import free_to_move, listed
+from tfeti_dolfinx.feti.rigid_bodies import Motions, free_to_move, listed
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, LastProduct, Operator
@@ -113,6 +113,7 @@ class Dual:
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
         last: The last solution of block Newton, or without a kernel, with its image.
         recycled: Directions of earlier solves; None: none are kept.
+        begin: Where the load step began, shape ``(n,)``; bodies that nothing holds stay near.
     """
 
     def __init__(
@@ -159,7 +160,6 @@ class Dual:
         self._on_all: FaceOperator | None = None
         self._on_last: tuple[Face, FaceOperator] | None = None
         self._held_load: Array | None = None
-        self._nearly_free: tuple[Array, list[dict[str, Any]]] | None = None
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
         springs, sigma = constraints.sets.springs, 1.0
@@ -180,6 +180,7 @@ class Dual:
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms = dict[int, float]()  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
+        self.begin: Array | float = 0.0
         self.recycled: Recycled | None = None
         self._learns = recycle == "auto"
         if isinstance(recycle, int) and recycle:
@@ -379,14 +380,10 @@ class Dual:
         lengths = norm_over(comm, known) + norm_over(comm, Fx)
         return lengths > LIMITS.far * norm_over(comm, self.driving)
 
-    def nearly_free(self, active: Array) -> list[dict[str, Any]]:
-        """List motions that ``active`` contact rows hold hardly or not, see ``listed``."""
-        known, comm = self._nearly_free, self.coarse.comm
-        if known is None or any_rank(comm, not np.array_equal(active, known[0])):
-            motions = self.coarse.unresisted(active, below=LIMITS.nearly)
-            found = bcast_from_root(comm, listed(motions, self.coarse.bodies, *self._names))
-            known = self._nearly_free = (active, found)
-        return known[1]
+    def nearly_free(self, loose: Motions) -> list[dict[str, Any]]:
+        """List motions of those that contact rows hold hardly or not, see ``listed``."""
+        hardly = replace(loose, free=loose.stiffness <= LIMITS.nearly)
+        return bcast_from_root(self.coarse.comm, listed(hardly, self.coarse.bodies, *self._names))
 
     def sliding(self, motion: Array) -> tuple[str, Array]:
         """Return a sentence on a motion of bodies, and local rows of friction that slip most."""

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import lsq_linear
+from scipy.sparse import csr_array, vstack
 
-from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, least, summed
+from tfeti_dolfinx.common.arrays import Array, rows_of
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, summed
 from tfeti_dolfinx.constraints.rows import Constraints
+from tfeti_dolfinx.errors import TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.feti.rigid_bodies import orthonormal_columns
+from tfeti_dolfinx.feti.rigid_bodies import Motions, orthonormal_columns, parts_of_columns
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -26,6 +29,7 @@ class Recovered:
     # flags of contact rows whose force is more than the solver's error, and of rows of friction
     # that the face holds, shape (m,)
     active: Array
+    loose: Motions  # motions of bodies that no active row resists
 
 
 def recover(
@@ -35,14 +39,17 @@ def recover(
     gradient: Array,
     face: Face,
     error: float,
+    begin: Array | float,
     no_effect: float = 10.0,
     damping: float = 1e-8,
 ) -> Recovered:
-    """u = K⁺(f − Bᵀλ) + Rα; of displacements that differ by free motions the smallest. Collective.
+    """u = K⁺(f − Bᵀλ) + Rα, as near to another displacement as rows let bodies be. Collective.
 
     α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for ν, the gaps of open rows
     as the solver left them. A step of the damped normal equations on the rows f that the face
     holds (equalities, λ_N > 0) makes theirs as small as α can: gaps may be far larger than u.
+    Motions that no row with a force resists are the solver's only by chance: of these places the
+    nearest to ``begin`` is taken, in the mean square over each body, that overlaps nowhere.
 
     Args:
         constraints: B and c.
@@ -51,6 +58,7 @@ def recover(
         gradient: Fλ − d up to the range of Gᵀ; on rows that the face does not hold it is ν.
         face: The face of λ.
         error: How large multipliers may be by the solver's error alone.
+        begin: The other displacement, shape ``(n,)``.
         no_effect: Of that: a larger force of a normal counts.
         damping: Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less would
             answer with their rounding over this share.
@@ -69,8 +77,6 @@ def recover(
             alpha = alpha + coarse.damped_solve(on_held, coarse.G(left), damping)
         u = u + coarse.kernel_motion(alpha)
     gap = residual - coarse.Gt @ alpha
-    if (N := coarse.free_basis).shape[1]:  # gaps do not change
-        u = u - coarse.kernel_motion(coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(u))))
     # what sticks to a given bound holds, pushed or not; under Coulomb's law what is pushed or pulls
     borne, active = np.abs(lam) > no_effect * error, np.zeros(len(lam), dtype=bool)
     active[coarse.bounded] = borne[coarse.bounded]
@@ -79,39 +85,53 @@ def recover(
     rows = constraints.sets.tangents[at]
     active[rows] = (borne[constraints.pressed_by[at]] | np.any(borne[rows], axis=1))[:, None]
     active &= face.carrying
-    return Recovered(np.array(lam), u, gap, residual, active)
+    loose = coarse.unresisted(active)
+    if loose.count:
+        motion = coarse.motions @ _motion_towards(coarse, loose, gap, active, begin - u)
+        u, gap = u + coarse.kernel_motion(motion), gap - coarse.Gt @ motion
+    return Recovered(np.array(lam), u, gap, residual, active, loose)
 
 
-def nearest(coarse: CoarseSpace, state: Recovered, rest: Array, nothing: float = 1e-10) -> Array:
-    """Return of displacements that are as right as one the nearest to another. Collective.
+def _motion_towards(
+    coarse: CoarseSpace, loose: Motions, gap: Array, active: Array, way: Array
+) -> Array:
+    """Return of motions that overlap nowhere the nearest to a displacement. Collective."""
+    comm, N = coarse.comm, bcast_from_root(coarse.comm, orthonormal_columns(loose.columns))
+    wanted = N.T @ coarse.bodies.part_of(way)
+    rows = coarse.bounded[~active[coarse.bounded]]
+    own = (
+        rows_of(coarse.J.csr() @ N, rows).csr(),
+        np.maximum(gap[rows], 0.0) / coarse.row_size[rows],
+    )
+    ranks, motion = comm.gather(own, root=0), None
+    with raised_on_all_ranks(comm):
+        if ranks is not None:
+            closing, gaps = zip(*ranks, strict=True)
+            C, g, motion = csr_array(vstack(closing)), np.concatenate(gaps), np.array(wanted)
+            for part, at, dense in parts_of_columns(C):
+                motion[part] = least_distance(dense, g[at], wanted[part])
+    return np.asarray(N @ bcast_from_root(comm, motion))
 
-    Motions that no active row holds go as far as the gaps of the other rows allow; what a row then
-    stops holds, and the others go on.
 
-    Args:
-        coarse: The coarse space.
-        state: The displacement, with its gaps and active rows.
-        rest: The other one, shape ``(n,)``.
-        nothing: Share of the largest motion of a body: a gap that changes by less does not change.
+def least_distance(C: Array, g: Array, t: Array) -> Array:
+    """Return the nearest point to t of those with C y ≤ g, 0 among them, else raise a TfetiError.
+
+    As nonnegative least squares (Lawson, Hanson, Solving Least Squares Problems, 1974, ch. 23).
+
+    >>> least_distance(np.array([[1.0, 0.0]]), np.array([0.5]), np.array([2.0, 1.0])).tolist()
+    [0.5, 1.0]
     """
-    u, gap, held, rows, left = state.u, state.gap, state.active, coarse.bounded, np.inf
-    while True:
-        N = bcast_from_root(coarse.comm, orthonormal_columns(coarse.unresisted(held).columns))
-        if not 0 < N.shape[1] < left:
-            return u
-        left = N.shape[1]
-        motion = N @ (N.T @ coarse.bodies.part_of(rest - u))
-        alpha = coarse.motions @ motion
-        closing = coarse.Gt @ alpha
-        closes = closing > nothing * np.abs(motion).max() * coarse.row_size
-        at = rows[(closes & ~held)[rows]]
-        allowed = np.maximum(gap[at], 0.0) / closing[at]
-        share = least(coarse.comm, float(allowed.min(initial=1.0)))
-        u, gap = u + share * coarse.kernel_motion(alpha), gap - share * closing
-        if share == 1.0:
-            return u
-        held = np.array(held)
-        held[at[allowed <= share]] = True
+    if not np.any(C @ t > g):
+        return t
+    size = np.linalg.norm(t)
+    some = 2.0 * size * np.linalg.norm(C, axis=1) > g  # the others are out of reach
+    E, f = np.vstack((-C[some].T, (C @ t - g)[some] / size)), np.append(np.zeros(len(t)), 1.0)
+    # scipy's nnls ends too early on rows that depend on each other
+    found = lsq_linear(E, f, (0.0, np.inf), method="bvls", tol=1e-15, max_iter=10 * len(E.T))
+    if not found.success:
+        raise TfetiError(f"the place of a body that nothing holds was not found: {found.message}")
+    r = E @ found.x - f
+    return np.asarray(t - size * r[:-1] / r[-1])
 
 
 def elastic_displacement(

@@ -202,6 +202,12 @@ class Motions:
         return int(self.free.sum()) + self.joint.shape[1]
 
     @property
+    def moving(self) -> Array:
+        """Flags of the bodies that some motion moves, shape ``(bodies,)``."""
+        joint = np.diff(self.joint.indptr).reshape(self.free.shape)
+        return np.any(self.free | (joint > 0), axis=1)
+
+    @property
     def columns(self) -> csr_array:
         """All of them as columns, those of single bodies first."""
         if not self.free.any():
@@ -219,7 +225,7 @@ def unsprung(shares: Array) -> Motions:
     return Motions(vectors, values < 0.5, values, none)
 
 
-def unresisted(grams: Sequence[Pairs], within: Motions, below: float = TOLERANCES.null) -> Motions:
+def unresisted(grams: Sequence[Pairs], within: Motions) -> Motions:
     """Return motions of a space of single bodies' motions that rows do not resist.
 
     1. Scale: the stiffest motion of each body is 1, and what is not in the space is left out.
@@ -230,8 +236,6 @@ def unresisted(grams: Sequence[Pairs], within: Motions, below: float = TOLERANCE
     Args:
         grams: JᵀJ of the rows, as ``BodyRows.gram`` has it, to be added up.
         within: The space to look in; its joint motions are not looked at.
-        below: Motions of a single body held by less than this share of its stiffest motion are
-            taken in too; those of several bodies must be free (and may have parts in those).
     """
     V, free, null = within.single, within.free, TOLERANCES.null
     pairs, which = np.unique(np.concatenate([pairs for pairs, _ in grams]), return_inverse=True)
@@ -269,7 +273,7 @@ def unresisted(grams: Sequence[Pairs], within: Motions, below: float = TOLERANCE
     ]
     parts = [(rows, X.reshape(len(rows), -1)) for rows, X in joint]
     return Motions(
-        V @ vectors, stiffness <= below, np.maximum(stiffness, 0.0), on_rows(parts, free.size)
+        V @ vectors, stiffness <= null, np.maximum(stiffness, 0.0), on_rows(parts, free.size)
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
-from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, nearest, recover
+from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, QPResult, StoppingRule
 from tfeti_dolfinx.qp.sets import Face
@@ -282,7 +282,8 @@ class Accuracy(StoppingRule):
         """Recover the displacement of an iterate, and measure it. Collective."""
         dual = self._dual
         error = residual / self.norm
-        self._measure(recover(dual.constraints, dual.coarse, lam, gradient, face, error), face)
+        given = lam, gradient, face, error, dual.begin
+        self._measure(recover(dual.constraints, dual.coarse, *given), face)
 
     def _measure(self, state: Recovered, face: Face) -> None:
         """Measure the displacement of an iterate. Collective."""
@@ -312,19 +313,10 @@ class Accuracy(StoppingRule):
         return bool(ratio <= 1.0 or longest <= self._atol)
 
     def examine_stopped(self, result: QPResult) -> None:
-        """Assess where a solver has stopped early: errors that rounding explains are accepted.
-
-        Motions that no active row holds are as right elsewhere: they are no change of u.
-        """
-        self._small, before = float("inf"), self.recovered
+        """Assess where a solver has stopped early: errors that rounding explains are accepted."""
+        self._small = float("inf")
         residual = max(result.projected_gradient, result.norm * result.equality)
-        given = result.lam, result.gradient, result.face, residual
-        reason = self.examine(*given)
-        now, older = self.recovered, self._before
-        if reason <= 0 and before is not None and now is not None and older is not None:
-            held = nearest(self._dual.coarse, now, before.u) - before.u
-            self.recovered, self.measures = replace(now, u=now.u - held), older
-            reason = self.examine(*given)
+        reason = self.examine(result.lam, result.gradient, result.face, residual)
         if reason > 0:
             result.reason = reason
 

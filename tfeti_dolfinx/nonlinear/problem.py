@@ -143,6 +143,7 @@ class NonlinearContactProblem(ContactProblem):
         self._exact, self._atol = self.options.number, self.options.atol
         self._system.follows = True
         self._begin = self._first
+        self._system.begin_at(self.dofs.to_primal(self._begin))
         length = bcast_from_root(decomposition.comm, diameter(decomposition))
         self._least = self._tolerances.nowhere * length if finite else 0.0
         # of where bodies are
@@ -203,7 +204,7 @@ class NonlinearContactProblem(ContactProblem):
                     f"Newton's method: after {step} steps {error}; or smaller load steps"
                 ) from error
             self._counts.newton_steps += 1
-            end = np.array(self.u.x.array)
+            end = self._turned(u, np.array(self.u.x.array))
             d = end - u
             size = largest(comm, d)
             increment = size / max(largest(comm, end), TINY) if size > self._last_digit else 0.0
@@ -234,11 +235,25 @@ class NonlinearContactProblem(ContactProblem):
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
                     faster.forget()
                     self._set(u + d)
-            forms.kept = keeping.next(size, t, tol.near * exact * largest(comm, end))
+            keeps = keeping.next(size, t, tol.near * exact * largest(comm, end))
+            # old places leave a body that is let go a moment, which drives it
+            forms.kept = keeping.kept = keeps and not np.any(self._let_go)
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
             f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
         )
+
+    def _turned(self, u: Array, end: Array) -> Array:
+        """Let bodies that are let go turn by finite angles from u, not by small ones. Collective.
+
+        Small ones stretch them, which would end the step early.
+        """
+        if not (self._finite and np.any(self._let_go)):
+            return end
+        subdomains, bodies = self._system.subdomains, self._system.dual.coarse.bodies
+        motion = bodies.part_of(subdomains.with_rigid(self.dofs.to_primal(end - u)))
+        amounts = bodies.amounts(motion) * self._let_go[:, None]
+        return end + self.dofs.to_dolfinx(subdomains.turned_beyond(amounts))
 
     def _advice(self, d: Array) -> str:
         """Say what may help, from the derivative of F along the last step. Collective."""
@@ -290,7 +305,6 @@ class NonlinearContactProblem(ContactProblem):
         warns &= self._settings.options.warnings
         atol = max(self._atol, self._last_digit)
         self.options = replace(self.options, rtol=rtol, atol=atol, warnings=warns)
-        self._near = self.dofs.to_primal(self.u.x.array)
         if self._places is not None:
             self._go_to_places(self._places)
         try:

@@ -9,6 +9,7 @@ from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
+from scipy.linalg import expm
 
 from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix
 from tfeti_dolfinx.errors import InputError
@@ -255,6 +256,13 @@ class Block:
     def modes(self) -> Array:
         """C, the candidate modes of the whole body, shape ``(n, k)``."""
         return candidate_modes(self.x, self.bs, *self._body_frame)
+
+    def turned_beyond(self, amounts: Array) -> Array:
+        """Return what finite turns move the nodes by beyond modes of these amounts, shape (n,)."""
+        (centre, length), gdim = self._body_frame, self.x.shape[1]
+        turns = candidate_modes(centre + np.eye(gdim), gdim, centre, length)[:, gdim:]
+        small = (turns @ amounts[gdim:]).reshape(gdim, gdim)
+        return np.asarray((self.x - centre) @ (expm(small) - np.eye(gdim) - small)).ravel()
 
     def apply_pinv(self, w: Array) -> Array:
         """K⁺ w on the trace for a force w on the trace, shapes ``(t,)``."""

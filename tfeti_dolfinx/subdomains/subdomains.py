@@ -229,6 +229,11 @@ class Subdomains:
         pairs = zip(self.blocks, self.body_of_block, strict=True)
         return joined([block.modes @ amounts[body] for block, body in pairs])
 
+    def turned_beyond(self, amounts: Array) -> Array:
+        """Return what finite turns add to ``modes_motion`` at nodes, shape ``(num_nodal,)``."""
+        pairs = zip(self.elastic, self.body_of_block, strict=False)
+        return joined([block.turned_beyond(amounts[body]) for block, body in pairs])
+
     def body_sums(self, values: Sequence[Sequence[float]]) -> Array:
         """Sums over the Blocks of each body, shape ``(q, b)``, of q values each. Collective.
 
