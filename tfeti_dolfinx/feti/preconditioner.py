@@ -107,7 +107,8 @@ class FacePreconditioner:
         size = bcast_from_root(comm, largest(comm, diagonal / self.weights))
         if metric.near is not None and size > 0.0:
             with raised_on_all_ranks(comm):
-                K, next_to = metric.near()
+                near, next_to = metric.near()
+                K = LocalMatrix(near)
             self.apply = lambda u, out: np.copyto(out, K @ u)
             self.weights = np.concatenate((self.weights, next_to / size))
         with raised_on_all_ranks(comm):
@@ -169,8 +170,7 @@ class _OnFace:
     ) -> None:
         self._on_all, self._face, self._factor = on_all, face, factor
         self._is_identity, self._bends = contact is None, False
-        self._moves: Array = np.zeros(0)
-        self._sizes: Array = np.zeros(0)
+        self._moves, self._sizes = np.zeros((2, 0))
         if contact is not None:
             Z_C, self._bent, size = contact
             self._Z_C, bends = LocalMatrix(Z_C), self._bent > 0.0
