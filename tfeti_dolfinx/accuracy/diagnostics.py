@@ -43,7 +43,14 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     middle = basix.geometry(cell).mean(axis=0)[None]
     slopes = element.tabulate(1, middle)[1:, 0, :, 0]
     J = np.tensordot(mesh.geometry.x[corners, :gdim], slopes, (1, 1))
-    return np.asarray(np.minimum(np.linalg.cond(J, "fro") / gdim, 1.0 / TINY))
+    # J⁻¹ is the adjugate over the determinant, turned
+    if gdim == 2:
+        adjugate = J[:, ::-1, ::-1] * [[1.0, -1.0], [-1.0, 1.0]]
+    else:
+        adjugate = np.cross(J[:, [1, 2, 0]], J[:, [2, 0, 1]])
+    volume = np.abs(np.einsum("ni,ni->n", J[:, 0], adjugate[:, 0]))
+    sizes = np.sqrt([np.einsum("nij,nij->n", A, A) for A in (J, adjugate)]).prod(axis=0)
+    return np.asarray(sizes / np.maximum(gdim * volume, TINY * sizes))
 
 
 # --- Nodes that bodies share without a common facet -------------------------------------------

@@ -183,7 +183,7 @@ class OnFace:
 
     def entered(self, lam: Array) -> Array:
         """Return λ with open and slipping entries set to those of p, coupled ones following."""
-        held = np.isin(self.face.status, (Status.OPEN, Status.SLIP))
+        held = (self.face.status == Status.OPEN) | (self.face.status == Status.SLIP)
         on = np.where(held, self.p, lam)
         on[self.C.rows] = self.C.ratios * lam[self.C.leaders]
         return on

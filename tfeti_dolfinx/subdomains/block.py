@@ -138,8 +138,8 @@ def kernel_of(K: Any, modes: Array) -> Array:
     return np.asarray(R[:, energy <= TOLERANCES.null * terms])
 
 
-def fixing_nodes(x: Array, count: int) -> Array:
-    """Choose at most ``count`` well-spread nodes by farthest-point sampling, ascending.
+def fixing_nodes(x: Array, count: int) -> list[int]:
+    """Choose at most ``count`` well-spread nodes by farthest-point sampling.
 
     From the node farthest out; of equal distances, as of the corners of a cube, the first:
     rounding must not choose (Gonzalez, Theor. Comput. Sci. 38, 1985).
@@ -150,7 +150,7 @@ def fixing_nodes(x: Array, count: int) -> Array:
         chosen.append(int(np.argmax(square >= (1.0 - 2.0 * TOLERANCES.equal) * square.max())))
         own = np.einsum("ni,ni->n", y := x - x[chosen[-1]], y)
         square = own if len(chosen) == 1 else np.minimum(square, own)
-    return np.unique(chosen)
+    return chosen
 
 
 def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
@@ -180,11 +180,8 @@ class Springs:
     stiffness: Array  # D, shape (k,)
 
     @classmethod
-    def of(
-        cls, modes: Array, R: Array, multiply: Callable[[Array], Array], soft: float
-    ) -> Springs | None:
-        """Return them, from candidate modes and K B; None where all D ≥ ``soft``."""
-        U = outside_motions(modes, R)
+    def of(cls, U: Array, multiply: Callable[[Array], Array], soft: float) -> Springs | None:
+        """Return them, from a basis U of motions outside and K B; None where all D ≥ ``soft``."""
         if not U.shape[1]:
             return None
         D, V = np.linalg.eigh(U.T @ multiply(U))

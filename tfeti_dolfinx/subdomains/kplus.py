@@ -11,7 +11,6 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, Entries, plus
-from tfeti_dolfinx.subdomains.block import candidate_modes, outside_motions
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
 # --- K⁺ -----------------------------------------------------------------------------------------
@@ -71,7 +70,8 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     # what moves in no motion may be far stiffer
     moves = np.abs(R).max(axis=1) > TOLERANCES.still * np.abs(R).max()
     added = K.diagonal()[moves].max() * (Q @ Q.T)
-    row, column = (index.ravel() for index in np.meshgrid(fixing_dofs, fixing_dofs, indexing="ij"))
+    count = len(fixing_dofs)
+    row, column = np.repeat(fixing_dofs, count), np.tile(fixing_dofs, count)
     whole = plus(K, row, column, added.ravel())
     if (kept := whole.data != 0.0).all():
         return whole
@@ -92,7 +92,9 @@ class InverseFactory:
 # --- Causes of indefinite stiffnesses -----------------------------------------------------------
 
 
-def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) -> str:
+def why_indefinite(
+    K: Any, R: Array, outside: Array, fixing_dofs: Array, x: Array, prefix: str
+) -> str:
     """Say what is wrong with a stiffness whose K_ρ has no Cholesky factor, or a useless one.
 
     Raise a FactorError where it could not be found out, say for want of memory.
@@ -103,7 +105,7 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
         factor = regularised(shifted, R, fixing_dofs, prefix)
     except NotPositiveDefiniteError:
         return "the stiffness is not positive semidefinite; expected a linear elastic form"
-    if gives_no_energy(K, R, x, factor):
+    if gives_no_energy(K, np.hstack((R, outside)), x, factor):
         return (
             f"the form gives no energy to motions besides the {R.shape[1]} of a rigid body that it "
             "leaves free; expected a linear elastic form of the whole strain, with quadrature that "
@@ -118,15 +120,14 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
     )
 
 
-def gives_no_energy(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> bool:
+def gives_no_energy(K: Any, rigid: Array, x: Array, inverse: CholeskyFactor) -> bool:
     """Return whether an inverse of K_ρ blows up a motion that is not rigid and has no energy.
 
-    Pivots that should be 0 are positive where rounding makes them so. It takes one solve.
+    Pivots that should be 0 are positive where rounding makes them so. ``rigid`` are all rigid
+    motions, as springs may hold some by little. It takes one solve.
     """
-    modes = candidate_modes(x, K.shape[0] // len(x), x.mean(axis=0), 1.0)
-    R = np.hstack((R, outside_motions(modes, R)))  # springs may hold those by little
-    force = _beside(R, _noise(K.shape[0]))
-    u = _beside(R, inverse.solve(force))
+    force = _beside(rigid, _noise(K.shape[0]))
+    u = _beside(rigid, inverse.solve(force))
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
     if not lost:
         return False

@@ -33,6 +33,7 @@ from tfeti_dolfinx.subdomains.block import (
     candidate_modes,
     fixing_dofs,
     kernel_of,
+    outside_motions,
 )
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import (
@@ -76,6 +77,7 @@ class Stiffness:
         self.diagonal = K.diagonal()
         modes = candidate_modes(x, self.bs, centre, length)
         self.kernel = self.null = R = kernel_of(K, modes)
+        outside = outside_motions(modes, R)
         how.factorizations += 1
         fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
@@ -83,15 +85,16 @@ class Stiffness:
             self.entries = self.size**2 / 2.0
             if isinstance(self._pinv, CholeskyFactor):
                 self.entries = self._pinv.entries
-                if gives_no_energy(K, R, x, self._pinv):
+                if gives_no_energy(K, np.hstack((R, outside)), x, self._pinv):
                     raise NotPositiveDefiniteError("a pivot is zero but for rounding")
         except NotPositiveDefiniteError as error:
-            raise InputError(f"{name}: {why_indefinite(K, R, fixing, x, how.prefix)}") from error
+            why = why_indefinite(K, R, outside, fixing, x, how.prefix)
+            raise InputError(f"{name}: {why}") from error
         except FactorError as error:
             raise FactorError(f"{name}: {error}") from error
         if how.soft:
             soft = how.soft * float(np.mean(self.diagonal)) * len(x) ** (-2.0 / x.shape[1])
-            self.springs = Springs.of(modes, R, self.product.__matmul__, soft)
+            self.springs = Springs.of(outside, self.product.__matmul__, soft)
         if self.springs is not None:
             self.kernel = np.hstack((R, self.springs.directions))
 
