@@ -99,17 +99,14 @@ def test_displacements_of_degree_1_are_warned_of_where_a_material_keeps_its_volu
     assert ("  warnings  1 logged; " in str(p.report)) == bool(found)
 
 
-@pytest.mark.parametrize("size", [0.02, 0.5])
-def test_rotations_beyond_linear_kinematics_are_warned_of(size):
-    p = problem(decomposed("quadrilateral", 4, 4), traction=(0.0, -size))
-    p.solve()
-    found = warnings_of("radians", p.report.warnings)
-    assert bool(found) == (size == 0.5), p.report.warnings
-    assert size == 0.5 or p.report.warnings == []
-
-
 def test_warnings_can_be_switched_off():
-    """Of a part that turns, and motions that a floor leaves free; the answer stays."""
+    """Of a part that turns, and motions that a floor leaves free; the answer stays.
+
+    Of a small load nothing is warned.
+    """
+    small = problem(decomposed("quadrilateral", 4, 4), traction=(0.0, -0.02))
+    small.solve()
+    assert small.report.warnings == []
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
     scenes = [{"traction": (0.0, -0.5)}, {"contacts": [floor], "clamped": ()}]
     for found, scene in zip(("warnings", "nearly_free"), scenes, strict=True):
@@ -158,15 +155,20 @@ def test_beams_that_rounding_bends_are_warned_of(slenderness, comm):
         assert (row["u"] > 1e-6) == far
 
 
-def test_what_rounding_ends_is_not_called_a_contradiction(comm):
-    """Nodes on one floor: no rows depend on each other, however little F is definite.
+@pytest.mark.parametrize(
+    ("name", "cell", "rtol"), [("flat block", "hexahedron", None), ("beam", "triangle", 1e-15)]
+)
+def test_what_rounding_ends_is_called_so_with_all_warnings(name, cell, rtol, comm):
+    """Nodes of the block are on one floor: no rows depend on each other, however flat it is.
 
-    Whether rounding is seen before the iterations have run out depends on the processor.
+    Whether its rounding is seen before the iterations have run out depends on the processor.
     """
-    row = run_scene(rung("flat block", "hexahedron", 1e4), comm)
+    scene = rung(name, cell, 1e4)
+    row = run_scene(replace(scene, options={"tfeti_rtol": rtol}) if rtol else scene, comm)
     if comm.rank == 0:
-        assert row["error"].startswith("ConvergenceError")
-        assert "DIVERGED_ROUNDING" in row["error"] or "DIVERGED_ITS" in row["error"]
+        assert row["error"].startswith("ConvergenceError: the dual solver stopped: DIVERGED_")
+        known = "DIVERGED_ROUNDING" in row["error"] and "rounding does not let" in row["error"]
+        assert known or (name == "flat block" and "DIVERGED_ITS" in row["error"])
         assert warnings_of("the flattest", row["warnings"])
 
 
@@ -184,23 +186,3 @@ def test_atol_is_a_length():
     p.solve()
     assert p.report.converged_reason == "CONVERGED_ATOL"
     assert p.report.residuals["gluing_jump"] <= 2e-5
-
-
-def test_rounding_is_called_so_with_all_warnings(comm):
-    scene = rung("beam", "triangle", 1e4)
-    row = run_scene(replace(scene, options={"tfeti_rtol": 1e-15}), comm)
-    if comm.rank == 0:
-        said = "ConvergenceError: the dual solver stopped: DIVERGED_ROUNDING"
-        assert row["error"].startswith(said)
-        assert "rounding does not let" in row["error"]
-        assert warnings_of("the flattest", row["warnings"])
-        assert all(warning in row["error"] for warning in row["warnings"])
-
-
-def test_rtol_0_asks_for_all_digits(comm):
-    """Whether rounding is said to have ended it or not, it has them."""
-    options = {"tfeti_rtol": 0.0, "tfeti_error_if_not_converged": False}
-    row = run_scene(replace(rung("cells", "triangle", 1e4), options=options), comm)
-    if comm.rank == 0:
-        assert row["reason"] in ("CONVERGED_RTOL", "DIVERGED_ROUNDING")
-        assert row["u"] <= 1e-10
