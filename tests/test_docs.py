@@ -78,9 +78,7 @@ def half_cylinder(serial_only, tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize(
-    ("document", "ranks"), [(document, 1 + (document in ON_TWO)) for document in PROGRAMS]
-)
+@pytest.mark.parametrize(("document", "ranks"), [(name, 1 + (name in ON_TWO)) for name in PROGRAMS])
 def test_programs_of_documents(half_cylinder, document, ranks, tmp_path):
     program = tmp_path / "program.py"
     program.write_text("\n".join(blocks(ROOT / document, "python")))
@@ -150,10 +148,7 @@ def test_every_block_of_a_page_is_run_or_has_a_reason():
     run = {f"./run {line}" for line in commands()}
     for path in [*DOCUMENTS, ROOT / "CONTRIBUTING.md", ROOT / "environment/README.md"]:
         for language, text in re.findall(r"^```(\S*)\n(.*?)^```", path.read_text(), re.S | re.M):
-            known = language in (*DIRECTIVES, "python", "") or (language, path) == (
-                "diff",
-                CONVERTED,
-            )
+            known = language in (*DIRECTIVES, "python", "", "diff" if path == CONVERTED else "")
             sample = (language, path.name) == ("text", "report.md")  # tests/test_figures.py
             lines = [] if known or sample else text.splitlines()
             assert not [s for s in lines if s not in run and not s.startswith(tuple(NOT_RUN))], path
@@ -203,6 +198,7 @@ def test_what_users_read_has_their_words():
 
 def test_user_pages_are_short():
     assert sum(len(prose(path).split()) for path in USER_PAGES) <= 15000
+    assert len(ast.parse(blocks(ROOT / "README.md", "python")[0]).body) <= 12
     bounds = dict.fromkeys((ROOT / "docs/howto").glob("*.md"), 400)
     bounds |= {ROOT / f"docs/{name}.md": 800 for name in PAGES[:4]}  # tutorials
     assert not [path for path, words in bounds.items() if len(prose(path).split()) > words]

@@ -382,6 +382,8 @@ class Dual:
 
     def nearly_free(self, loose: Motions) -> list[dict[str, Any]]:
         """List motions of those that contact rows hold hardly or not, see ``listed``."""
+        if not self.coarse.unheld.free.any():  # conditions hold all bodies: contact need not
+            return []
         hardly = replace(loose, free=loose.stiffness <= LIMITS.nearly)
         return bcast_from_root(self.coarse.comm, listed(hardly, self.coarse.bodies, *self._names))
 
