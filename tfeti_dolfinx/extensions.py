@@ -90,7 +90,6 @@ def guarded(own: Extensions, options: Options, comm: MPI.Intracomm) -> Extension
     """Return the parts of a solve; what fails is named, on all ranks where they run on all.
 
     Blocks and K⁺ are made where ranks raise together. Clusters are parts of the package's own.
-    Raise an InputError where clusters are asked for beside other subdomains or another deflation.
     """
     if options.clusters and (own.subdomains is not None or own.deflation is not None):
         raise InputError(

@@ -38,7 +38,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.qp.sets import Face
-from tfeti_dolfinx.report import Outcome, Report, SolverCounts, added, largest_over_ranks
+from tfeti_dolfinx.report import Outcome, Report, SolverCounts, added
 from tfeti_dolfinx.saved_state import SavedState, check_state
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
@@ -333,9 +333,9 @@ class ContactProblem:
 
     def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""
-        seconds = largest_over_ranks(self._seconds, self.decomposition.comm)
         records = self._system.sizes(), self._system.take_counts(), self._counts, self._outcome
-        self.report.take(Report.composed(records, seconds, self._in_all))
+        comm = self.decomposition.comm
+        self.report.take(Report.composed(records, self._seconds, self._in_all, comm))
         self._seconds, self._in_all = {}, self.report.in_all
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:

@@ -316,11 +316,18 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
     def composed(
         cls,
         records: tuple[Sizes, StageCounts, SolverCounts, Outcome],
-        seconds: Mapping[str, float],
+        own_seconds: Mapping[str, float],
         before: Mapping[str, float],
+        comm: MPI.Intracomm,
     ) -> Report:
-        """Compose the report of a solve; ``before`` is ``in_all`` of the solves before it."""
+        """Compose the report of a solve; ``before`` is ``in_all`` of the solves before it.
+
+        The seconds of a stage are those of the slowest rank. Collective.
+        """
         known = {name: value for record in records for name, value in vars(record).items()}
+        of_ranks = comm.allgather(dict(own_seconds))
+        stages = dict.fromkeys(name for seconds in of_ranks for name in seconds)
+        seconds = {name: max(own.get(name, 0.0) for own in of_ranks) for name in stages}
         total = sum(seconds.values())
         own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
         return cls(**known, seconds=Seconds(seconds, total=total), in_all=added(before, own))
@@ -443,13 +450,6 @@ def _item(item: str | list[float] | dict[str, Any]) -> str:
 def added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
     """Return the sums of numbers by name."""
     return {name: one.get(name, 0) + other.get(name, 0) for name in {**one, **other}}
-
-
-def largest_over_ranks(seconds: Mapping[str, float], comm: MPI.Intracomm) -> dict[str, float]:
-    """Return the seconds of each stage on the slowest rank. Collective."""
-    of_ranks = comm.allgather(dict(seconds))
-    names = dict.fromkeys(name for own in of_ranks for name in own)
-    return {name: max(own.get(name, 0.0) for own in of_ranks) for name in names}
 
 
 def _local_operators(dual: Dual) -> dict[str, float]:

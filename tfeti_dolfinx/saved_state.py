@@ -7,7 +7,6 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
@@ -57,13 +56,6 @@ def labels_of_dofs(dofmap: Array, count: int, decomposition: Decomposition) -> A
     cell[dofmap[order]] = ids[order][:, None]
     place[dofmap[order]] = np.arange(dofmap.shape[1])
     return numbered(subdomain, cell, place)
-
-
-def labels_of_function(f: fem.Function, decomposition: Decomposition) -> Array:
-    """Return labels of the blocks of unknowns of a function on the torn mesh."""
-    V = f.function_space
-    count = len(f.x.array) // V.dofmap.bs
-    return labels_of_dofs(np.asarray(V.dofmap.list), count, decomposition)
 
 
 def labels_of_nodes(dofs: TornDofs) -> Array:
@@ -237,20 +229,14 @@ class SavedState:
         return found
 
     def on_nodes(self, dofs: TornDofs) -> SavedState:
-        """Return the state with nodes and cells in the order of this rank. Not collective.
-
-        Raise an InputError where it has other ones.
-        """
+        """Return the state with nodes and cells in the order of this rank. Not collective."""
         here = {"nodes": labels_of_nodes(dofs)}
         if self.internal.size:
             here["cells"] = labels_of_cells(dofs.decomposition)
         return self._in_order(here)
 
     def on_rows(self, gluing: Gluing) -> SavedState:
-        """Return the state with rows and conditions in the order of a problem's. Collective.
-
-        Raise an InputError where it has other ones.
-        """
+        """Return the state with rows and conditions in the order of a problem's. Collective."""
         of_groups = labels_of_groups(gluing.dofs, self.nodes)
         here = {
             "rows": labels_of_rows(gluing, of_groups),

@@ -42,7 +42,6 @@ from tfeti_dolfinx.forms.fields import (
     from_vertices,
     frozen,
     nodal,
-    vector_from_vertices,
     von_mises,
 )
 from tfeti_dolfinx.mortar.facets import facet_nodes, group_points, hat_integrals, surface_facets
@@ -258,14 +257,15 @@ class Solution:
         A node of several contacts has the sum of their forces over their areas, each part of a
         surface counted once.
         """
-        return self._field(self._over_areas(self.force[:, None])[:, 0], "pressure")
+        values = self._over_areas(self.force[:, None])[:, 0]
+        return from_vertices(self.dofs, values, self._vertices, "pressure")
 
     @cached_property
     def gap(self) -> fem.Function:
         """Remaining gap after deformation; 0 where there is no contact condition (see status)."""
         values = np.full(self.dofs.num_groups, np.inf)
         np.minimum.at(values, self.gluing.records.group, self.remaining_gap)
-        return self._field(np.where(self._vertices, values, 0.0), "gap")
+        return from_vertices(self.dofs, values, self._vertices, "gap")
 
     @cached_property
     def status(self) -> fem.Function:
@@ -273,7 +273,7 @@ class Solution:
         values = np.full(self.dofs.num_groups, float(ContactStatus.NONE))
         known = self.status_of_conditions.astype(float)
         np.maximum.at(values, self.gluing.records.group, known)
-        function = self._field(values, "status")
+        function = from_vertices(self.dofs, values, self._vertices, "status")
         function.x.array[:] = np.floor(function.x.array)  # between nodes: the lesser of the two
         return function
 
@@ -286,13 +286,13 @@ class Solution:
         """
         surfaces = [name for contact in self.contacts for name in contact.surfaces]
         values, area = vertex_tractions(self.nodal_forces, self.dofs, surfaces, self.thickness)
-        return vector_from_vertices(self.dofs, values, area > 0.0, "traction")
+        return from_vertices(self.dofs, values, area > 0.0, "traction")
 
     @cached_property
     def tangential_traction(self) -> fem.Function:
         """Friction on the secondary sides and at obstacles over the area, a vector; 0 elsewhere."""
         values = self._over_areas(self.tangential_force)
-        return vector_from_vertices(self.dofs, values, self._vertices, "tangential_traction")
+        return from_vertices(self.dofs, values, self._vertices, "tangential_traction")
 
     @cached_property
     def slip(self) -> fem.Function:
@@ -305,7 +305,7 @@ class Solution:
         count = sum_rows(records.group, slips, size)
         total = sum_rows(records.group, slips[:, None] * self.slip_of_conditions, size)
         values = total / np.maximum(count, 1.0)[:, None]
-        return vector_from_vertices(self.dofs, values, self._vertices, "slip")
+        return from_vertices(self.dofs, values, self._vertices, "slip")
 
     @cached_property
     def body_forces(self) -> Resultant:
@@ -335,12 +335,6 @@ class Solution:
         area = np.minimum(area, whole)[:, None]
         return np.divide(total, area, out=np.zeros_like(total), where=area > 0.0)
 
-    def _field(self, values: Array, name: str) -> fem.Function:
-        """Scalar function from values of the owned groups with a condition, 0 elsewhere."""
-        function = from_vertices(self.dofs, values, self._vertices)
-        function.name = name
-        return function
-
     # ---------------------------------------- contacts, conditions, rigid bodies
 
     def places(self) -> Array:
@@ -367,10 +361,7 @@ class Solution:
         records = self.gluing.records
         own = records.contact == position
         points, places = (x[records.group[own]] for x in (group_points(self.dofs), self.places()))
-        area = self.area[:, None]
-        traction = np.divide(
-            self.tangential_force, area, out=0.0 * self.tangential_force, where=area > 0.0
-        )
+        friction, area = self.tangential_force[own], self.area[own, None]
         return ContactData(
             points=points,
             normal=records.normal[own],
@@ -379,7 +370,7 @@ class Solution:
             area=self.area[own],
             gap=self.remaining_gap[own],
             status=self.status_of_conditions[own],
-            tangential_traction=traction[own],
+            tangential_traction=np.divide(friction, area, out=0.0 * friction, where=area > 0.0),
             slip=self.slip_of_conditions[own],
             surface=self.contacts[position].surfaces[0],
             resultant=resultant(self.dofs.comm, places, self.condition_forces[own]),

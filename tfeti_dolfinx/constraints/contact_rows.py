@@ -72,7 +72,7 @@ class RowBuilder:
         )
         rigid = self._rigid
         if rigid is None:
-            return of_nodes.without_zeros()
+            return of_nodes
         of = np.flatnonzero(place[rigid.condition] >= 0)
         row, along = place[rigid.condition[of]], self._along(axis)[of]
         return Rows(
@@ -80,7 +80,7 @@ class RowBuilder:
             row=np.concatenate((of_nodes.row, row)),
             column=np.append(of_nodes.column, dofs.offsets[-1] * dofs.bs + rigid.unknown[of]),
             value=np.append(of_nodes.value, along * scale[row]),
-        ).without_zeros()
+        )
 
     def _along(self, axis: int) -> Array:
         """Coefficients of the unknowns of rigid bodies along an axis of the frames."""

@@ -71,33 +71,25 @@ def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, He
 
 
 def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
-    """Gluing rows of all free components of groups with k copies."""
+    """Gluing rows of all free components of groups with k copies.
+
+    Gram–Schmidt on e_i − e_{i+1}: rows (w_1, …, w_j, −W_j) over norms, W_j = w_1 + … + w_j.
+    """
     group, component = np.nonzero((dofs.multiplicity == k)[:, None] & ~flag)
     places = dofs.copy_offsets[group][:, None] + np.arange(k)
     columns = dofs.copies[places] * dofs.bs + component[:, None]
-    pattern = _orthonormal(weights[places, component[:, None]])
-    n = len(group)
-    row, copy = (index.ravel() for index in np.indices((n * (k - 1), k)))
+    w, j = weights[places, component[:, None]], np.arange(k - 1)
+    sums = np.cumsum(w, axis=1)
+    rows = np.tril(np.ones((k - 1, k))) * w[:, None, :]
+    rows[:, j, j + 1] = -sums[:, :-1]
+    rows /= np.sqrt(sums[:, :-1] + sums[:, :-1] ** 2 / w[:, 1:])[:, :, None]
+    row, copy = (index.ravel() for index in np.indices((len(group) * (k - 1), k)))
     return Rows(
         group=np.repeat(group, k - 1),
         row=row,
         column=columns[row // (k - 1), copy],
-        value=pattern.reshape(-1, k)[row, copy],
-    ).without_zeros()
-
-
-def _orthonormal(weights: Array) -> Array:
-    """Return rows with zero sum, orthonormal in diag(weights)⁻¹: ``(n, k)`` to ``(n, k - 1, k)``.
-
-    Gram–Schmidt on e_i − e_{i+1}: rows (w_1, …, w_j, −W_j) over norms, W_j = w_1 + … + w_j.
-    """
-    k = weights.shape[1]
-    sums = np.cumsum(weights, axis=1)
-    rows = np.tril(np.ones((k - 1, k))) * weights[:, None, :]
-    j = np.arange(k - 1)
-    rows[:, j, j + 1] = -sums[:, :-1]
-    norms = sums[:, :-1] + sums[:, :-1] ** 2 / weights[:, 1:]
-    return rows / np.sqrt(norms)[:, :, None]
+        value=rows.reshape(-1, k)[row, copy],
+    )
 
 
 # --- Dirichlet values on torn copies ----------------------------------------------------------
@@ -112,10 +104,7 @@ class Prescribed:
 
 
 def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
-    """Collect Dirichlet values and spread them to all copies of their nodes. Collective.
-
-    Raise an InputError where conditions contradict each other at a node, or are not finite.
-    """
+    """Collect Dirichlet values and spread them to all copies of their nodes. Collective."""
     size = dofs.V.dofmap.index_map.size_local * dofs.bs
     values = np.full((len(bcs), size), np.nan)
     for row, bc in zip(values, bcs, strict=True):
@@ -203,10 +192,7 @@ def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
 
 
 def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
-    """Return the conditions as a list. Not collective.
-
-    Raise an InputError where they are nothing that gives Dirichlet conditions.
-    """
+    """Return the conditions as a list; raise an InputError for anything else. Not collective."""
     if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
         raise InputError(
             f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"

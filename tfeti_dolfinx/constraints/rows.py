@@ -48,11 +48,6 @@ class Rows:
     def __len__(self) -> int:
         return len(self.group)
 
-    def without_zeros(self) -> Rows:
-        """Return the same rows without entries that are zero."""
-        used = self.value != 0.0
-        return Rows(self.group, self.row[used], self.column[used], self.value[used])
-
 
 def stack(tables: list[Rows]) -> Rows:
     """Return the rows of several tables, one table after the other, and so are their entries."""
@@ -216,6 +211,8 @@ def assemble_constraints(
     unknowns of rigid bodies, on the last rank behind those of its nodes.
     """
     rows = stack(list(tables))
+    used = rows.value != 0.0
+    rows = Rows(rows.group, rows.row[used], rows.column[used], rows.value[used])
     ends = np.cumsum([len(table) for table in tables])[:-1]
     equalities, normals, tangents = np.split(np.arange(len(rows)), ends)
     width = dofs.bs - 1  # rows of a condition stand together

@@ -140,10 +140,7 @@ class Coulomb(FrictionLaw):
 def with_friction(
     name: str, friction: FrictionLaw | None, records: ContactRecords, dofs: TornDofs
 ) -> ContactRecords:
-    """Give a contact's conditions its friction, and tangents along its direction. Collective.
-
-    Raise an InputError where the space is scalar, or the direction does not fit.
-    """
+    """Give a contact's conditions its friction, and tangents along its direction. Collective."""
     if friction is None:
         return records
     gdim = dofs.bs

@@ -11,7 +11,7 @@ from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.parallel import Exchange, owner_of, summed
+from tfeti_dolfinx.common.parallel import Exchange, largest, owner_of, summed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import Facets, hat_integrals
 from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals, Triplets
@@ -206,9 +206,8 @@ def _mean_gaps(
 
 def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
     """0 in the place of gaps that rounding of coordinates may have made of it. Collective."""
-    own = float(np.abs(dofs.V.mesh.geometry.x).max(initial=0.0))
-    largest = dofs.comm.allreduce(own, op=MPI.MAX)
-    return np.where(np.abs(gap) <= SEARCH.no_gap * largest, 0.0, gap)
+    allowed = SEARCH.no_gap * largest(dofs.comm, dofs.V.mesh.geometry.x)
+    return np.where(np.abs(gap) <= allowed, 0.0, gap)
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:

@@ -48,10 +48,7 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
 
 
 def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
-    """Check and return the thickness, a number or a scalar in UFL. Collective.
-
-    Raise an InputError where it is neither, negative somewhere, or on another mesh.
-    """
+    """Return the thickness, a number or a scalar in UFL, once it is checked. Collective."""
     if not isinstance(thickness, ufl.core.expr.Expr):
         return checked_number(thickness, "thickness", POSITIVE)
     if thickness.ufl_shape != ():
@@ -152,34 +149,24 @@ def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     return function
 
 
-def from_vertices(dofs: TornDofs, values: Array, vertices: Array) -> fem.Function:
-    """Scalar function from values of the owned groups that are vertices, both ``(g,)``. Collective.
+def from_vertices(dofs: TornDofs, values: Array, vertices: Array, name: str) -> fem.Function:
+    """Function from values, ``(g,)`` or ``(g, bs)``, of owned groups that are vertices. Collective.
 
     Nodes between vertices take the value of the linear interpolant where all those vertices have
     one, else 0: a field of a surface stays on the surface.
     """
-    (S, _), (W, node) = dofs.scalar, dofs.hats
-    function, inside = fem.Function(S), fem.Function(S)
-    linear, share = fem.Function(W), fem.Function(W)
-    linear.x.array[:] = dofs.spread(np.where(vertices, values, 0.0))[node]
-    share.x.array[:] = dofs.spread(vertices.astype(float))[node]
-    function.interpolate(linear)
-    inside.interpolate(share)
-    function.x.array[inside.x.array < 1.0 - 1e-8] = 0.0
-    return function
-
-
-def vector_from_vertices(dofs: TornDofs, values: Array, vertices: Array, name: str) -> fem.Function:
-    """Vector function from values at vertices, shape ``(g, bs)``, as ``from_vertices``.
-
-    Collective.
-    """
-    function = fem.Function(dofs.V, name=name)
-    components = function.x.array.reshape(-1, dofs.bs)
-    for i in range(dofs.bs):
-        component = from_vertices(dofs, values[:, i], vertices)
-        components[dofs.dolfinx_node, i] = component.x.array[dofs.scalar[1]]
-    return function
+    (S, dof), (W, node) = dofs.scalar, dofs.hats
+    linear, scalar = fem.Function(W), fem.Function(S, name=name)
+    linear.x.array[:] = dofs.spread(vertices.astype(float))[node]
+    scalar.interpolate(linear)
+    outside = scalar.x.array < 1.0 - 1e-8
+    vector = fem.Function(dofs.V, name=name)
+    for i, component in enumerate(values.T if values.ndim > 1 else [values]):
+        linear.x.array[:] = dofs.spread(np.where(vertices, component, 0.0))[node]
+        scalar.interpolate(linear)
+        scalar.x.array[outside] = 0.0
+        vector.x.array.reshape(-1, dofs.bs)[dofs.dolfinx_node, i] = scalar.x.array[dof]
+    return scalar if values.ndim == 1 else vector
 
 
 class StressRecovery:

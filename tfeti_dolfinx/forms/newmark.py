@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import assemble_csr
+from tfeti_dolfinx.common.parallel import largest
 from tfeti_dolfinx.common.validation import POSITIVE, Range, check_stiffness, checked_number
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Data, Forms, data_of
@@ -209,9 +209,9 @@ def check_copies(values: Array, dofs: TornDofs, name: str, left: float = 1e-3) -
             raise InputError(f"{name} has values that are not finite numbers")
     most = dofs.reduce(primal, np.maximum)
     apart = dofs.spread(most - dofs.reduce(primal, np.minimum)).max(axis=1, initial=0.0)
-    size = dofs.comm.allreduce(float(np.abs(primal).max(initial=0.0)), op=MPI.MAX)
+    allowed = left * largest(dofs.comm, primal)
     with raised_on_all_ranks(dofs.comm):
-        if np.any(apart > left * size):
+        if np.any(apart > allowed):
             worst = int(np.argmax(apart))
             x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node[worst]]
             at = ", ".join(f"{x:.6g}" for x in x[: dofs.bs])

@@ -101,11 +101,7 @@ def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) ->
 
 
 def read_content(model: Any, where: str) -> ModelContent:
-    """Read the elements in physical groups, names and nodes of a gmsh model.
-
-    Raise an InputError where an element lies in several physical groups, or the elements of a
-    dimension are of several types. Messages call the model ``where``.
-    """
+    """Read the elements in physical groups, names and nodes of a gmsh model."""
     with named("gmsh.model (is gmsh initialised, with a model in it?)"):
         top = max((dim for dim, _ in model.getPhysicalGroups()), default=0)
     found = {dim: _elements(model, dim) for dim in range(max(top - 1, 1), top + 1)}
@@ -141,17 +137,11 @@ def _names(model: Any, dim: int) -> dict[str, int]:
     names = {}
     for _, tag in model.getPhysicalGroups(dim):
         name = model.getPhysicalName(dim, tag)
-        if not PARTITION_GROUP.fullmatch(name):
+        if not (match := PARTITION_GROUP.fullmatch(name)):
             names[name or str(tag)] = int(tag)
-        elif tag_of := _original_physical_group(model, dim, tag):
+        elif tag_of := int(match[1]):
             names.setdefault(model.getPhysicalName(dim, tag_of) or str(tag_of), tag_of)
     return names
-
-
-def _original_physical_group(model: Any, dim: int, tag: int) -> int:
-    """Return the group that a partition's group stands for, or the group itself."""
-    match = PARTITION_GROUP.fullmatch(model.getPhysicalName(dim, tag))
-    return int(match[1]) if match else int(tag)
 
 
 def _elements(model: Any, dim: int) -> Elements | None:
@@ -163,7 +153,8 @@ def _elements(model: Any, dim: int) -> Elements | None:
             parent_dim, parent = model.getParent(dim, entity)
             if parent_dim == dim:
                 of_entity = model.getPhysicalGroupsForEntity(dim, parent)
-        groups = {_original_physical_group(model, dim, tag) for tag in of_entity}
+        matches = [PARTITION_GROUP.fullmatch(model.getPhysicalName(dim, t)) for t in of_entity]
+        groups = {int(m[1] if m else t) for m, t in zip(matches, of_entity, strict=True)}
         kinds, ids, nodes = model.mesh.getElements(dim, entity)
         if not groups or len(kinds) == 0:
             continue

@@ -51,8 +51,7 @@ ONE_MODEL = "expected files that gmsh has written from one model with Mesh.Parti
 def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> list[Path]:
     """Return the files ``name_1.msh``, ``name_2.msh``, ... of a mesh; none of a model or one file.
 
-    Collective. Only rank 0 looks, at the source that it was given. Raise an InputError where a file
-    is missing in the numbering.
+    Collective. Only rank 0 looks, at the source that it was given.
     """
     files: list[Path] = []
     with raised_on_all_ranks(comm):
@@ -74,10 +73,7 @@ def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> 
 
 
 def read_split_files(files: Sequence[Path], comm: MPI.Intracomm) -> list[ModelContent]:
-    """Read this rank's files, a cell's partition being its file's number. Collective.
-
-    Raise an InputError where a file cannot be read, or partitions are missing.
-    """
+    """Read this rank's files, a cell's partition being its file's number. Collective."""
     contents = []
     with raised_on_all_ranks(comm):
         for number, file in enumerate(files, start=1):

@@ -66,11 +66,7 @@ class FacetElement:
 
 
 def from_first(x: Array) -> Array:
-    """Return nodes of facets from the first one on, shape ``(n, nodes, d)``.
-
-    Tangents are sums of these times slopes: slopes add up to 0 but for rounding, which would turn
-    a facet that is far from the origin.
-    """
+    """Return nodes of facets from the first one on: rounding turns none that is far from 0."""
     return np.asarray(x - x[:, :1])
 
 
@@ -310,10 +306,7 @@ def _solve(A: Array, b: Array) -> Array:
 
 
 def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
-    """Local facets of a contact surface, ascending. Collective.
-
-    Raise an InputError where the surface is unknown, empty, or lies inside a body.
-    """
+    """Local facets of a contact surface, which is a part of the boundary, ascending. Collective."""
     facets = decomposition.facets(name)
     comm = decomposition.comm
     if comm.allreduce(len(facets)) == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -240,7 +240,8 @@ def integrate(
     if np.any(secondary.held) and np.any(primary.held):
         corner, *held = _held(kind, (secondary, primary), corners, dual.facet)
         dual, used = dual.with_points(kind, *held)
-        at = at.and_also(corners, corner[used])
+        both = ((getattr(at, f.name), getattr(corners, f.name)[corner[used]]) for f in fields(at))
+        at = FacingPoints(*map(np.concatenate, both))
         segments = replace(segments, points=at)
     gap = curved_gap = _gaps(kind, secondary, primary, segments, dual)
     if np.any(secondary.curvature) or np.any(primary.curvature):
@@ -318,17 +319,18 @@ def _gaps(
     curved: bool = False,
 ) -> GapIntegrals:
     """Return gaps over segments, between the facets or the smooth surfaces that they stand for."""
-    normals = secondary.vertex_normals[dual.facet]
-    at, corners = (
-        _apart(kind, secondary, primary, of, curved) for of in (segments.points, segments.corners)
-    )
-    lowest, highest = _range(
-        dual,
-        normals,
-        np.concatenate((segments.points.secondary, segments.corners.secondary)),
-        np.concatenate((at, corners)),
-        segments.whole,
-    )
+    normals, both = secondary.vertex_normals[dual.facet], (segments.points, segments.corners)
+    at, corners = (_apart(kind, secondary, primary, of, curved) for of in both)
+    # n_i·(x_p − x_s) at points and corners
+    place = np.searchsorted(dual.facet, np.concatenate([of.secondary for of in both]))
+    gap = np.einsum("md,mvd->mv", np.concatenate((at, corners)), normals[place])
+    lowest, highest = np.full(dual.covered.shape, np.inf), np.full(dual.covered.shape, -np.inf)
+    np.minimum.at(lowest, place, gap)
+    np.maximum.at(highest, place, gap)
+    # covered in part a multiplier extrapolates: upwards that is right, downwards it could overlap
+    highest[~segments.whole[dual.facet]] = np.inf
+    counts = dual.covered.sum(axis=1) > 0.0  # what is hardly covered has no multipliers
+    lowest[~counts], highest[~counts] = np.inf, -np.inf
     return GapIntegrals(np.sum(dual.integrals(at) * normals, axis=2), lowest, highest)
 
 
@@ -348,21 +350,3 @@ def _apart(
     normal = points(kind.hats, secondary.vertex_normals[at.secondary], at.xi)
     distance = np.sum((there - here) * normal, axis=1) / np.sum(normal**2, axis=1)
     return distance[:, None] * normal
-
-
-def _range(
-    dual: FacetMultipliers, normals: Array, facet: Array, apart: Array, whole: Array
-) -> tuple[Array, Array]:
-    """Smallest and largest n_i·(x_p − x_s) that multipliers weigh on each facet; ∞ covered in part.
-
-    There a multiplier extrapolates: upwards that is right, downwards it could overlap.
-    """
-    place = np.searchsorted(dual.facet, facet)
-    gap = np.einsum("md,mvd->mv", apart, normals[place])
-    lowest, highest = np.full(dual.covered.shape, np.inf), np.full(dual.covered.shape, -np.inf)
-    np.minimum.at(lowest, place, gap)
-    np.maximum.at(highest, place, gap)
-    highest[~whole[dual.facet]] = np.inf
-    counts = dual.covered.sum(axis=1) > 0.0  # what is hardly covered has no multipliers
-    lowest[~counts], highest[~counts] = np.inf, -np.inf
-    return lowest, highest

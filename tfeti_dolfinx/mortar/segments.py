@@ -169,12 +169,6 @@ class FacingPoints:
     xi: Array  # reference coordinates on the secondary facet, shape (m, tdim)
     eta: Array  # reference coordinates on the primary facet, shape (m, tdim)
 
-    def and_also(self, others: FacingPoints, rows: Array) -> FacingPoints:
-        """Return these points and some others after them."""
-        names = [f.name for f in fields(self)]
-        pairs = ((getattr(self, name), getattr(others, name)[rows]) for name in names)
-        return FacingPoints(*(np.concatenate(pair) for pair in pairs))
-
 
 @dataclass(frozen=True)
 class Segments:

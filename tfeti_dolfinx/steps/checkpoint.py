@@ -205,10 +205,7 @@ class Checkpoint:
                     (self.path / f"state_{before.number}_{rank}.npz").unlink(missing_ok=True)
 
     def read_state(self, kept: Kept) -> SavedState:
-        """Return the state of this rank at the step that ``read`` found.
-
-        Raise an InputError where it is not what was written.
-        """
+        """Return the state of this rank at the step that ``read`` found."""
         index = kept.index
         table = self._load("state", index.number, index.states, index.subdomains, INDEX)
         state = SavedState.from_table(table)
@@ -221,10 +218,7 @@ class Checkpoint:
         return replace(state, mu=none, image=none, predicted_image=none, directions=directions)
 
     def read_fields(self, kept: Kept, number: int) -> Table:
-        """Return the fields of a step, of those that ``read`` found, on this rank.
-
-        Raise an InputError where they are not what was written, or there are none.
-        """
+        """Return the fields of a step, of those that ``read`` found, on this rank."""
         checksums = kept.fields[number - 1]
         if not checksums:
             raise InputError(

@@ -38,7 +38,6 @@ from tfeti_dolfinx.saved_state import (
     Table,
     arranged,
     labels_of_dofs,
-    labels_of_function,
     rows_of,
     same_labels,
 )
@@ -127,18 +126,18 @@ def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
 # --- Fields of a step in a checkpoint ----------------------------------------------------------
 
 
-def labels_of_fields(solution: Solution, interior: bool = False) -> dict[str, Array]:
+def labels_of_fields(solution: Solution, interior: bool) -> dict[str, Array]:
     """Return the labels of the unknowns of ``fields_of``, and of the points. Collective."""
-    d, fields = solution.decomposition, chain(*changing_fields(solution, interior))
-    points = labels_of_dofs(geometry_dofmap(d.mesh), len(d.mesh.geometry.x), d)
-    return {**{f.name: labels_of_function(f, d) for f in fields}, POINTS: points}
+    d, labels = solution.decomposition, dict[str, Array]()
+    for f in chain(*changing_fields(solution, interior)):
+        dofmap = f.function_space.dofmap
+        labels[f.name] = labels_of_dofs(np.asarray(dofmap.list), len(f.x.array) // dofmap.bs, d)
+    labels[POINTS] = labels_of_dofs(geometry_dofmap(d.mesh), len(d.mesh.geometry.x), d)
+    return labels
 
 
 def in_order(table: Table, labels: dict[str, Array]) -> dict[str, Array]:
-    """Return fields as ``fields_of`` does, from a table whose rows have labels.
-
-    Raise an InputError where a field has other labels.
-    """
+    """Return fields as ``fields_of`` does, from a table whose rows have labels."""
     found = {}
     for name, (values, kept) in table.items():
         here = labels.get(name, kept)

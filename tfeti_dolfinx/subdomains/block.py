@@ -138,28 +138,23 @@ def kernel_of(K: Any, modes: Array) -> Array:
     return np.asarray(R[:, energy <= TOLERANCES.null * terms])
 
 
-def fixing_nodes(x: Array, count: int) -> list[int]:
-    """Choose at most ``count`` well-spread nodes by farthest-point sampling.
+def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
+    """Return positions of the unknowns at well-spread nodes, given the node of each unknown.
 
-    From the node farthest out; of equal distances, as of the corners of a cube, the first:
-    rounding must not choose (Gonzalez, Theor. Comput. Sci. 38, 1985).
+    By farthest-point sampling, from the node farthest out; of equal distances, as of the corners
+    of a cube, the first: rounding must not choose (Gonzalez, Theor. Comput. Sci. 38, 1985).
     """
-    chosen: list[int] = []
+    asked, fixed = np.zeros((2, len(x)), dtype=bool)
+    asked[node_of_dof] = True
+    nodes, chosen = np.flatnonzero(asked), list[int]()
+    x = x[nodes]
     square = np.einsum("ni,ni->n", y := x - x.mean(axis=0), y)
-    while len(chosen) < min(count, len(x)):
+    while len(chosen) < min(2 ** x.shape[1], len(x)):
         chosen.append(int(np.argmax(square >= (1.0 - 2.0 * TOLERANCES.equal) * square.max())))
         own = np.einsum("ni,ni->n", y := x - x[chosen[-1]], y)
         square = own if len(chosen) == 1 else np.minimum(square, own)
-    return chosen
-
-
-def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
-    """Return positions of the unknowns at well-spread nodes, given the node of each unknown."""
-    asked, chosen = np.zeros((2, len(x)), dtype=bool)
-    asked[node_of_dof] = True
-    nodes = np.flatnonzero(asked)
-    chosen[nodes[fixing_nodes(x[nodes], 2 ** x.shape[1])]] = True
-    return np.flatnonzero(chosen[node_of_dof])
+    fixed[nodes[chosen]] = True
+    return np.flatnonzero(fixed[node_of_dof])
 
 
 # --- Soft springs -----------------------------------------------------------------------------

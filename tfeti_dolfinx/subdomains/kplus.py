@@ -54,18 +54,11 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
 
     K_ρ⁻¹ is an exact generalised inverse, because N R is regular (Brzobohatý, Dostál, Kozubek,
     Kovář, Markopoulos, IJNME 88, 2011, section 4). Raise a NotPositiveDefiniteError where K_ρ has
-    no Cholesky factor; a FactorError where it could not be made for another reason.
-    """
-    return CholeskyFactor(regular_matrix(K, R, fixing_dofs), prefix)
-
-
-def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
-    """K_ρ without what is 0, of a scipy CSR K; K itself, maybe ``Entries``, where R has no columns.
-
-    The fixing unknowns ascend.
+    no Cholesky factor; a FactorError where it could not be made for another reason. K is scipy CSR,
+    or ``Entries`` where R has no columns; the fixing unknowns ascend.
     """
     if R.shape[1] == 0:
-        return K
+        return CholeskyFactor(K, prefix)
     Q, _ = np.linalg.qr(R[fixing_dofs])
     # what moves in no motion may be far stiffer
     moves = np.abs(R).max(axis=1) > TOLERANCES.still * np.abs(R).max()
@@ -73,10 +66,10 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     count = len(fixing_dofs)
     row, column = np.repeat(fixing_dofs, count), np.tile(fixing_dofs, count)
     whole = plus(K, row, column, added.ravel())
-    if (kept := whole.data != 0.0).all():
-        return whole
-    table = np.concatenate(([0], np.cumsum(kept)))[whole.indptr]
-    return Entries(whole.data[kept], whole.indices[kept], table, K.shape)
+    if not (kept := whole.data != 0.0).all():
+        table = np.concatenate(([0], np.cumsum(kept)))[whole.indptr]
+        whole = Entries(whole.data[kept], whole.indices[kept], table, K.shape)
+    return CholeskyFactor(whole, prefix)
 
 
 @dataclass
@@ -126,8 +119,9 @@ def gives_no_energy(K: Any, rigid: Array, x: Array, inverse: CholeskyFactor) -> 
     Pivots that should be 0 are positive where rounding makes them so. ``rigid`` are all rigid
     motions, as springs may hold some by little. It takes one solve.
     """
-    force = _beside(rigid, _noise(K.shape[0]))
-    u = _beside(rigid, inverse.solve(force))
+    noise = _noise(K.shape[0])
+    u = inverse.solve(noise - rigid @ (rigid.T @ noise))
+    u -= rigid @ (rigid.T @ u)
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
     if not lost:
         return False
@@ -143,8 +137,3 @@ def gives_no_energy(K: Any, rigid: Array, x: Array, inverse: CholeskyFactor) -> 
 @lru_cache(64)
 def _noise(size: int) -> Array:
     return np.random.default_rng(0).standard_normal(size)
-
-
-def _beside(R: Array, u: Array) -> Array:
-    """Return the part that is orthogonal to the kernel."""
-    return u - R @ (R.T @ u)

@@ -266,10 +266,7 @@ class EqualSubdomains:
                 self.kept[block.name] = (block.stiffness, block.__dict__.get("traced"))
 
     def find(self, name: str, x: Array, K: Any) -> tuple[Stiffness, Array]:
-        """Return the stiffness that is equal to K, or a new one; and where K's unknowns are in it.
-
-        Raise an InputError where K does not fit; a FactorError where a factor could not be made.
-        """
+        """Return the stiffness equal to K, or a new one, and the places of K's unknowns in it."""
         bs = K.shape[0] // len(x)
         shape, nodes = places_in_order(x)
         known = self._of_shape[bytes([bs]) + shape]

@@ -135,9 +135,8 @@ class Subdomains:
     def kernel_rows(self) -> csr_array:
         """R on the trace, shape ``(t, r)``."""
         parts = [block.kernel[block.trace_dofs] for block in self.blocks]
-        rows = [part.start for part in self.trace_parts]
-        columns = [part.start for part in self.kernel_parts]
-        return _assembled(parts, rows, columns, (len(self.trace), sum(p.shape[1] for p in parts)))
+        shape = len(self.trace), sum(part.shape[1] for part in parts)
+        return _assembled(parts, self.trace_parts, self.kernel_parts, shape)
 
     @property
     def springs(self) -> list[Springs | None]:
@@ -147,17 +146,14 @@ class Subdomains:
     @property
     def spring_rows(self) -> csr_array:
         """√D PᵀR of the springs, shape ``(k, r)``."""
-        found = list(zip(self.blocks, self.springs, strict=True))
         parts = [
             np.zeros((0, block.kernel.shape[1]))
             if own is None
             else np.sqrt(own.stiffness)[:, None] * (own.stretches.T @ block.kernel)
-            for block, own in found
+            for block, own in zip(self.blocks, self.springs, strict=True)
         ]
-        rows = [part.start for part in self.spring_parts]
-        columns = [part.start for part in self.kernel_parts]
         shape = sum(map(len, parts)), sum(part.shape[1] for part in parts)
-        return _assembled(parts, rows, columns, shape)
+        return _assembled(parts, self.spring_parts, self.kernel_parts, shape)
 
     def spring_motions(self, u: Array) -> Array:
         """√D Pᵀu of the springs, shape ``(k,)``, for u of shape ``(n,)``."""
@@ -192,10 +188,9 @@ class Subdomains:
     def modes_in_kernel(self) -> csr_array:
         """Rᵀ C, C the candidate modes of all bodies, shape ``(r, b * k)``."""
         parts = [block.kernel.T @ block.modes for block in self.blocks]
-        rows = [part.start for part in self.kernel_parts]
-        columns = [self.num_modes * int(body) for body in self.body_of_block]
-        shape = (sum(len(part) for part in parts), self.num_bodies * self.num_modes)
-        return _assembled(parts, rows, columns, shape)
+        bodies = [slice(self.num_modes * int(body), None) for body in self.body_of_block]
+        shape = sum(map(len, parts)), self.num_bodies * self.num_modes
+        return _assembled(parts, self.kernel_parts, bodies, shape)
 
     def modes_outside(self) -> Array:
         """Σ Cᵀ(I − R Rᵀ)C / tr CᵀC over the Blocks of a body, shape ``(b, k, k)``. Collective.
@@ -303,13 +298,13 @@ class Subdomains:
 
 
 def _assembled(
-    parts: Sequence[Array], rows: Sequence[int], columns: Sequence[int], shape: tuple[int, int]
+    parts: Sequence[Array], rows: Sequence[slice], columns: Sequence[slice], shape: tuple[int, int]
 ) -> csr_array:
-    """Dense parts at these first rows and columns of a sparse matrix."""
+    """Dense parts at these rows and columns of a sparse matrix."""
     places, values = [np.empty((2, 0), dtype=np.int64)], []
     for part, row, column in zip(parts, rows, columns, strict=True):
         i, j = np.indices(part.shape)
-        places.append(np.stack(((row + i).ravel(), (column + j).ravel())))
+        places.append(np.stack(((row.start + i).ravel(), (column.start + j).ravel())))
         values.append(part.ravel())
     row_of, column_of = np.concatenate(places, axis=1)
     return entries_at(row_of, column_of, joined(values), shape).csr()
