@@ -104,7 +104,7 @@ def test_a_monitor_of_one_s_own():
 
 def test_a_stopping_rule_of_one_s_own():
     class InEnergy(Accuracy):
-        def ratio(self, changes=True):
+        def ratio(self):
             return self.measures.error / (1e-2 * self.measures.energy)
 
     obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))]

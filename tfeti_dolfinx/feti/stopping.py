@@ -39,9 +39,6 @@ class StoppingTolerances:
     # a tolerance never falls by more at once, since the size of the displacement may have been
     # learnt from a poor iterate
     leap: float = 1e-6
-    # the true residual has stalled if the digits it fell by are less than this share of those that
-    # the updated one fell by
-    stall: float = 0.5
 
 
 # --- Measures of an iterate in physical units -------------------------------------------------
@@ -63,7 +60,6 @@ class Measures:
     penetration: float
     balance: float  # force left on a kernel mode, where it is largest beside the forces there
     forces: float  # size of these forces
-    residual: float  # norm of what rows miss
     gap: float  # largest gap of a contact row, or overlap
     begin: float  # largest slip that friction counts from
     # what rounding leaves of the residuals of rows that the face holds, however far others are open
@@ -108,9 +104,9 @@ def measure(
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     d = dual.d
     held_d, held_F = (x[face.holding] for x in (d, state.residual + d))
-    squares = np.array([x @ x for x in (w, state.lam, held_d, held_F)])
+    squares = np.array([x @ x for x in (state.lam, held_d, held_F)])
     comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-    residual, multipliers, *sizes = np.sqrt(squares)
+    multipliers, *sizes = np.sqrt(squares)
     # 2. its correction
     closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))
     v = min_norm_correction(constraints, w, closed)
@@ -154,7 +150,6 @@ def measure(
         penetration=float(largest[0]),
         balance=balance,
         forces=forces,
-        residual=float(residual),
         gap=float(largest[1]),
         begin=float(largest[2]),
         rounding=ROUNDING * float(sum(sizes)),
@@ -230,7 +225,7 @@ class Accuracy(StoppingRule):
         # where nothing drives any force, rows that only just touch have forces that are rounding
         drives = reference > self._rounding
         self._small = 0.01 * max(rtol * reference, self._rounding) if drives else self._rounding
-        self.looks, self._stalls, self._claimed = 0, 0, 1.0
+        self.looks = 0
         self.recovered: Recovered | None = None
         self._before: Measures | None = None
         # of a look with other multipliers: the first one's errors
@@ -241,23 +236,16 @@ class Accuracy(StoppingRule):
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Assess an iterate, and return why to stop, or ITERATING. Collective."""
         self.look(lam, gradient, face, residual)
-        given, now, before = self._limits, self.measures, self._before
+        given, now = self._limits, self.measures
         # 1. errors over their tolerances; forces of a body that falls far may be known better
         # than the rounding of its fall allows, but for those that move nothing beyond rounding
         moves = now.effect > self._rounding
-        stalled = False
-        if before is not None and before.residual > 0.0:
-            fell = (residual / self._claimed) ** given.stall
-            stalled = now.residual / before.residual > fell
-        worst = self.ratio()
-        ratio, own, longest, in_energy, bound, lags = steering(
+        ratio, longest, in_energy, bound = steering(
             self._dual.coarse.comm,
-            worst,
-            worst if before is None else self.ratio(changes=False),
+            self.ratio(),
             self.measures.longest,
             moves * now.error / max(given.energy * self.rtol * now.energy, TINY),
             self._over_goal(),
-            float(stalled),
         )
         if ratio <= 1.0 and (in_energy <= 1.0 or residual <= self._small):
             return ConvergedReason.CONVERGED_RTOL
@@ -269,13 +257,9 @@ class Accuracy(StoppingRule):
         tolerance = residual * max(aim / (ratio if ratio > 1.0 else in_energy), given.leap)
         if ratio <= 1.0:
             tolerance = max(tolerance, self._small)
-        elif tolerance < least:  # the change since a poor iterate says little
-            tolerance = residual * max(given.aim / max(own, 1.0), given.leap)
-        # 3. where the true residual lags behind the solver's twice, rounding has the last word
-        self._stalls = self._stalls + 1 if lags else 0
-        if self._stalls > 1 or tolerance <= least:
+        if tolerance <= least:  # rounding has the last word
             return ConvergedReason.DIVERGED_ROUNDING
-        self.tolerance, self._claimed = float(tolerance), residual
+        self.tolerance = float(tolerance)
         return ConvergedReason.ITERATING
 
     def look(self, lam: Array, gradient: Array, face: Face, residual: float) -> None:
@@ -320,12 +304,9 @@ class Accuracy(StoppingRule):
         if reason > 0:
             result.reason = reason
 
-    def errors(self, changes: bool = True) -> Array:
-        """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``.
-
-        ``changes``: what has changed since the look before it counts.
-        """
-        now, before = self.measures, self._before if changes else None
+    def errors(self) -> Array:
+        """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``."""
+        now, before = self.measures, self._before
         energy = np.sqrt(np.maximum(now.energies, 0.0))
         # where all is rounding, energy does not say how far anything moves
         noise = self._limits.noise * now.size.max(initial=0.0) + self._at_rest()
@@ -359,10 +340,10 @@ class Accuracy(StoppingRule):
             energy=given.energy * self.rtol * now.energy + rigid,
         )
 
-    def ratio(self, changes: bool = True) -> float:
+    def ratio(self) -> float:
         """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
         now, allowed = self.measures, self.tolerances()
-        errors = np.array([*self.errors(changes), now.penetration, now.balance, now.error])
+        errors = np.array([*self.errors(), now.penetration, now.balance, now.error])
         limits = np.array([*allowed.displacement, allowed.jump, allowed.balance, allowed.energy])
         return max(float(np.max(errors / np.maximum(limits, TINY))), self._over_goal())
 

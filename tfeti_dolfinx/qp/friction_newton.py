@@ -216,10 +216,7 @@ def _solved_on_face(
     basis = known_on(qp.recycled, on, oblique.project)
     size = program.norm * norm_over(comm, way)
     if size > parameters.unseen * target:
-        # Step 3b: F of the way, if it can be seen; known directions come before, for nothing
-        b = -oblique.project(s + on.face.bend(u))
-        z, image, _ = gcr(apply, precondition, b, np.inf, basis, comm, parameters)
-        u, s = u + z, s + image
+        # Step 3b: F of the way, if it can be seen
         image = qp.F(way)
         s = s + image
         if qp.recycled is not None and qp.coarse.dimension == 0:  # else it restores Gλ = e

@@ -419,25 +419,13 @@ class FaceSolver:
         return z
 
     def _restored(self, end: Point) -> Point | None:
-        """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e; None: none.
-
-        Where it holds a body no longer, the nearest feasible point within the face before names
-        rows that do, so that faces shrink and steps end.
-        """
-        qp, before = self._qp, self._face
-        assert before is not None
+        """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e; None: none."""
+        qp = self._qp
         on = qp.feasible.project(end.lam)
         s = end.g - qp.coarse.combined(self.coarse.coordinates(end.g))
         self._enter(qp.feasible.face(on, s))
         lam = on + self.coarse.combined(self.coarse.solve(qp.coarse.residual(on)))
-        if imbalance(qp.coarse, lam) > HELD:
-            within = WithinFace(qp.feasible, before, slipping=True)
-            lam, _ = project_onto_feasible(qp.coarse, within, on)
-            if imbalance(qp.coarse, lam) > HELD:
-                return None
-            on = 0.5 * (on + lam)
-            self._enter(qp.feasible.face(on, s))
-        return qp.at(lam)
+        return None if imbalance(qp.coarse, lam) > HELD else qp.at(lam)
 
     def _has_left(self, z: Point) -> bool:
         """Return whether rows that do not slip are outside of Ω."""

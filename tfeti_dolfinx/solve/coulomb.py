@@ -57,9 +57,6 @@ class CoulombParameters:
     # of the largest forces of normals on a body: those of a lighter one count as so large
     light: float = 1e-6
     rounding: float = 2e-16  # of ‖F‖‖λ‖, or of ‖d‖: no residual is less
-    # most steps of a problem with the bounds of the law, which begins at its answer: bounds that
-    # are rounding leave a body to be turned by rounding
-    confirming: int = 100
     # of what bends, of gaps and of what is prescribed: a slip without end. It is below 10 where
     # friction holds, below 1e3 where it holds 1e-6 more than the load, 1e4 and more where it fails
     slips: float = 1e4
@@ -114,8 +111,7 @@ def solve_with_friction(
         asked = rtol if law is None else least
         exact = goal if asked <= least else None
         # how exact the first of the law has to be a look tells
-        most = parameters.confirming if aim < np.inf else 0
-        limited = replace(options, max_it=min(options.max_it, most)) if law else options
+        limited = replace(options, max_it=0) if law and aim == np.inf else options
         result, rule = solve_dual(
             dual, limited, qp_type, law or start, monitor, exact, make_rule, rtol=asked
         )
@@ -124,7 +120,8 @@ def solve_with_friction(
         if result.reason <= 0:
             if law is None and not bounds.turn(result.reason):
                 break
-            law = law and newton.go_on(law, bounds, result.reason, reached, aim == np.inf)
+            looked = aim == np.inf and result.reason == ConvergedReason.DIVERGED_ITS
+            law = law and newton.go_on(law, bounds, reached, looked)
             aim = reached
             if not law and (motion := bounds.hold()) is not None:
                 break
@@ -204,7 +201,7 @@ class FrictionBounds:
         self._stuck, self._slipped = start is None, False
         self.now: Array = np.full(len(self._rows), np.inf)
         if start is not None:
-            known = max(growth(dual.coarse, start[0]), 1.0) * dual.pressures[at]
+            known = dual.pressures[at]
             lost = any_rank(self._comm, not np.all(np.isfinite(known)))
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
             self.now = np.where(self._unknown(), np.inf, self.now)
@@ -230,19 +227,14 @@ class FrictionBounds:
         return None
 
     def turn(self, reason: ConvergedReason) -> bool:
-        """Let all stick where no forces within the bounds are found to balance a load, once.
+        """Let all slip, once, where sticking contradicts itself, as beside a wall that pushes.
 
-        They may be those of an earlier load that was far smaller. Or slip, once, where sticking
-        contradicts itself, as beside a wall that pushes, or where bounds of forces that are gone
-        leave a body that is let go to rounding. Return whether there are other bounds.
+        Or where bounds of forces that are gone leave a body that is let go to rounding. Return
+        whether there are other bounds.
         """
-        stalled = reason == ConvergedReason.DIVERGED_STALLED
-        if stalled and not self._stuck:
-            self.now, self._stuck = np.full(len(self._rows), np.inf), True
-            return True
         contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
-        lost = stalled or contradicts or reason == ConvergedReason.DIVERGED_ROUNDING
-        if not lost or self._slipped:
+        lost = reason in (ConvergedReason.DIVERGED_STALLED, ConvergedReason.DIVERGED_ROUNDING)
+        if not (lost or contradicts) or self._slipped:
             return False
         self.now, self._slipped = np.zeros(len(self._rows)), True
         return True
@@ -348,23 +340,14 @@ class NewtonOnLaw:
         self._rests = not any_rank(dual.coarse.comm, other)
 
     def go_on(
-        self,
-        law: tuple[Array, Array],
-        bounds: FrictionBounds,
-        reason: ConvergedReason,
-        aim: float,
-        first: bool,
+        self, law: tuple[Array, Array], bounds: FrictionBounds, aim: float, looked: bool
     ) -> tuple[Array, Array] | None:
-        """Go on from an answer that wants more digits, or go back.
+        """Go on from the first answer, which has only been looked at, or go back.
 
-        It is the first one, or its problem wants more than it has itself: where friction lets a
-        body slide, the law tells its place better than given bounds do. Else bounds become those
-        before the answer, and Newton's method is tried no more.
+        Then bounds become those before the answer, and Newton's method is tried no more.
         """
-        wants = reason == ConvergedReason.DIVERGED_ROUNDING
-        wants |= first and reason == ConvergedReason.DIVERGED_ITS
         before = bounds.before
-        again = self.solve(law, bounds, aim) if wants else None
+        again = self.solve(law, bounds, aim) if looked else None
         if again is None:
             self.tries, self._dual.recycled, bounds.now = 0, self.recycled, before
         bounds.before = before
