@@ -6,7 +6,7 @@ import ufl
 from bodies import drawn, held, sided, stacked, two_body_problem
 from dolfinx import fem
 from reference.untorn import on_plane, untorn_box
-from scenes import clamp, decomposed, displacement, forms, hooke, strain, vectors
+from scenes import clamp, decomposed, displacement, forms, hooke
 
 import tfeti_dolfinx as tfeti
 
@@ -42,9 +42,8 @@ class Scene:
         gdim = self.gdim = d.mesh.geometry.dim
         self.traction, self.value = (fem.Constant(d.mesh, np.zeros(gdim)) for _ in range(2))
         plane = tfeti.Plane((0,) * gdim, (0,) * (gdim - 1) + (1,))
-        obstacle = tfeti.Obstacle(
-            "bottom", plane, gap=gap, friction=law(friction, gdim)[0], reach=0.5
-        )
+        rubs = law(friction, gdim)[0]
+        obstacle = tfeti.Obstacle("bottom", plane, gap=gap, friction=rubs, reach=0.5)
         self.problem = two_body_problem(
             d,
             drawn(d, loaded, self.traction),
@@ -110,7 +109,6 @@ def follow(seed, qp_type="newton", cells=tuple(SIZES), laws=LAWS):
     scene = Scene(cell, kind, friction, gap, qp_type=qp_type, rtol=rtol)
     other = Reference(cell, kind, friction, gap)
     about = f"seed {seed}: {cell} {kind} {friction} gap {gap} {qp_type} accepts {accepts}"
-    slips = friction != "none" and accepts
     share = (100.0 if friction in ("coulomb", "orthotropic") else 1.0) * 10.0 * rtol
     wrong, most = [], 0.0
     for i, (traction, value) in enumerate(path(rng, scene.gdim, kind)):
@@ -122,7 +120,7 @@ def follow(seed, qp_type="newton", cells=tuple(SIZES), laws=LAWS):
             wrong.append(f"{about}, step {i} {traction} {value}: {error}")
             continue
         apart = np.abs(u - expected).max()
-        if not apart <= share * size + (1e-13 * most if slips else 0.0):
+        if not apart <= share * size + (1e-13 * most if accepts and friction != "none" else 0.0):
             wrong.append(f"{about}, step {i} {traction} {value}: {apart:.2e} of {size:.2e}")
         most = max(most, size)
         if accepts:
@@ -202,13 +200,11 @@ def test_a_body_brought_to_another_only_touches_it(cell, gap, friction):
     """Forces are rounding, for which nothing is solved; what presses them knows of no ‖F‖ yet."""
     d = stacked(cell, 3, 4, 4 if friction is None else 2, upper=(0.1, 0.9), gap=gap)
     value = fem.Constant(d.mesh, np.zeros(d.mesh.geometry.dim))
-    V, u, v = vectors(d)
-    problem = tfeti.ContactProblem(
-        ufl.inner(hooke()(u), strain(v)) * ufl.dx,
-        ufl.ZeroBaseForm((v,)),
-        [clamp(V, d.facets("lower bottom")), clamp(V, d.facets("upper top"), value)],
-        [sided("upper bottom", "lower top", reach=1.0, friction=friction)],
+    problem = two_body_problem(
         d,
+        lambda v, ds: ufl.ZeroBaseForm((v,)),
+        lambda V: [clamp(V, d.facets("lower bottom")), clamp(V, d.facets("upper top"), value)],
+        [sided("upper bottom", "lower top", reach=1.0, friction=friction)],
     )
     for pressed in (0.0, 0.01, 0.0):
         value.value[0], value.value[-1] = 0.01 * (friction is None), -gap - pressed
@@ -264,17 +260,22 @@ def test_a_body_at_rest_behind_an_open_gap_does_not_limit_that_either(friction, 
     p.destroy()
 
 
-def test_a_body_that_contact_alone_holds_comes_to_rest():
-    gap, d = 0.01, decomposed("triangle", 6, 3)
+@pytest.mark.parametrize("gap", [0.01, 0.0])
+def test_bodies_that_contact_alone_holds_come_to_rest(gap):
+    d = stacked("quadrilateral", 4, 4, 2)
     load = fem.Constant(d.mesh, np.zeros(2))
-    plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), gap=gap, reach=0.5)
-    problem = two_body_problem(d, drawn(d, "top", load), held(d, "left"), [plane])
+    plane = tfeti.Obstacle("lower bottom", tfeti.Plane((0, -1), (0, 1)), gap=gap, reach=0.5)
+    given = drawn(d, "upper top", load), held(d, "lower left", "upper left")
+    problem = two_body_problem(d, *given, [plane, sided("upper bottom", "lower top")])
     for pressed in (0.05, 0.0, 1e-13, 0.05, 0.0):
         load.value[1] = -pressed
         problem.solve()
         # ε of plane strain under a pressure: (1 + ν)(1 − 2ν)/(1 − ν)/E would be held at both sides
-        expected = -pressed * (1 - 0.3**2) - (gap if pressed else 0.0)
-        assert displacement(problem)[1][:, 1].min() == pytest.approx(expected, rel=1e-5, abs=1e-18)
+        low = -2.0 * pressed * (1 - 0.3**2) - (gap if pressed else 0.0)
+        found = displacement(problem)[1][:, 1].min()
+        assert found == pytest.approx(low, rel=1e-5, abs=1e-18 if gap else 1e-15)
+        if gap == 0.0:  # where the next step begins: its rounding is no overlap
+            problem.accept()
     problem.destroy()
 
 

@@ -61,7 +61,8 @@ class Measures:
     balance: float  # force left on a kernel mode, where it is largest beside the forces there
     forces: float  # size of these forces
     gap: float  # largest gap of a contact row, or overlap
-    begin: float  # largest slip that friction counts from
+    # largest slip that friction counts from, or displacement from which loose motions are found
+    begin: float
     # what rounding leaves of the residuals of rows that the face holds, however far others are open
     rounding: float
     error: float  # norm of the correction in energy, over all bodies
@@ -95,11 +96,11 @@ def measure(
     w[normals] = np.where(closed | (overlap > 0.0), overlap, still)
     lengths = np.abs((w[normals], c[normals])) / constraints.scale
     penetration, gap = np.max(lengths, axis=1, initial=0.0)
-    begin = 0.0
+    begin = float(np.max(np.abs(dual.begin), initial=0.0)) if state.loose.count else 0.0
     if tangents.size:
         w[tangents] = norm * within(dual.feasible, state.lam, tangents, w[tangents] / norm)
         slips = np.linalg.norm((w[tangents], c[tangents]), axis=2) / constraints.tangent_scale
-        penetration, begin = max(penetration, slips[0].max()), slips[1].max()
+        penetration, begin = max(penetration, slips[0].max()), max(begin, slips[1].max())
     largest = np.array([penetration, gap, begin])
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     d = dual.d
