@@ -16,7 +16,7 @@ parser = argparse.ArgumentParser(description="A half cylinder on meshes that fol
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--subdomains", type=int, default=8, help="subdomains")
 parser.add_argument("--error", type=float, help="relative discretisation error in energy")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

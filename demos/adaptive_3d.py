@@ -15,7 +15,7 @@ import petsc4py
 parser = argparse.ArgumentParser(description="A half ball on meshes that follow the error.")
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--error", type=float, help="relative discretisation error in energy")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

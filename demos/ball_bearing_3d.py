@@ -24,7 +24,7 @@ parser.add_argument(
 parser.add_argument("--unknowns", type=int, help="number of unknowns, about")
 parser.add_argument("--subdomains", type=int, help="gmsh partitions")
 parser.add_argument("--large", action="store_true", help="700 subdomains, 1.7 M unknowns")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

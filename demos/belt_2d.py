@@ -23,7 +23,7 @@ parser.add_argument("--angle", type=float, default=180.0, help="on the drum, in 
 parser.add_argument("--friction", type=float, default=0.3, help="its coefficient")
 parser.add_argument("--subdomains", type=int, help="of the belt; the drum has half as many")
 parser.add_argument("--cells", type=int, help="quadrilaterals along the belt on the drum")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

@@ -21,7 +21,7 @@ parser.add_argument("--quick", action="store_true", help="a size of a few second
 parser.add_argument("--subdomains", type=int, help="their number")
 parser.add_argument("--refine", type=int, default=0, help="how often elements are halved")
 parser.add_argument("--steps", type=int, help="load steps of Q, up to 0.8 μP")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

@@ -17,7 +17,7 @@ parser.add_argument("--quick", action="store_true", help="a size of a few second
 parser.add_argument("--subdomains", type=int, default=8, help="their number, a cube: 8, 64")
 parser.add_argument("--cells", type=int, help="hexahedra along an edge of a subdomain")
 parser.add_argument("--springs", type=float, default=0.0, help="in each point, that hold it softly")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

@@ -29,7 +29,7 @@ parser.add_argument("--plain", action="store_true", help="steps that are not sta
 parser.add_argument(
     "--poisson", type=float, default=0.3, help="Poisson's ratio of the bar on the wall"
 )
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

@@ -19,7 +19,7 @@ parser = argparse.ArgumentParser(
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--size", type=float, help="element size")
 parser.add_argument("--steps", type=int, default=10, help="load steps along the slab")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

@@ -20,7 +20,7 @@ parser.add_argument("--cells", type=int, help="cubes along the height of the bea
 parser.add_argument("--degree", type=int, default=1, help="of the displacement")
 parser.add_argument("--ratio", type=float, default=10.0, help="modulus of the upper half")
 parser.add_argument("--springs", type=float, default=0.0, help="in each point, that hold it softly")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

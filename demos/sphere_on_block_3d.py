@@ -19,7 +19,7 @@ parser.add_argument("--quick", action="store_true", help="a size of a few second
 parser.add_argument("--unknowns", type=int, help="number of unknowns, about")
 parser.add_argument("--subdomains", type=int, help="their number")
 parser.add_argument("--exchange", action="store_true", help="let the ball be the secondary side")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

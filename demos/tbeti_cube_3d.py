@@ -19,7 +19,7 @@ parser = argparse.ArgumentParser(
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--subdomains", type=int, default=8, help="their number: 8, 64, 216")
 parser.add_argument("--cells", type=int, help="hexahedra along an edge of a subdomain")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

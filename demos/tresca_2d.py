@@ -17,7 +17,7 @@ parser.add_argument("--quick", action="store_true", help="a size of a few second
 parser.add_argument("--subdomains", type=int, default=16, help="their number, a square")
 parser.add_argument("--cells", type=int, help="quadrilaterals along an edge of a subdomain")
 parser.add_argument("--bound", type=float, default=0.006, help="of the tangential traction")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()

@@ -19,7 +19,7 @@ parser.add_argument("--quick", action="store_true", help="a size of a few second
 parser.add_argument("--subdomains", type=int, choices=(1, 4, 8, 64, 512, 1024), default=4)
 parser.add_argument("--cells", type=int, help="hexahedra along an edge of a subdomain")
 parser.add_argument("--bound", type=float, help="of the tangential traction")
-parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--plot", action="store_true", help="draw pictures in results/, or in DIR")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
 arguments, rest = parser.parse_known_args()
