@@ -200,12 +200,8 @@ TYPES = re.compile(r"(ksp|snes|tao|qp|qps|mat_solver)_type", re.IGNORECASE)
 def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
     """Options from the command line, else from a dictionary, else the defaults.
 
-    Raise an InputError where an option is unknown, its value does not fit, or the command line has
-    options that PETSc was not given.
-
-    Args:
-        given: Options of the program, with or without the prefix.
-        prefix: Prefix of all options, e.g. ``"tfeti_"``.
+    Names in the dictionary have the prefix or not. Raise an InputError where an option is unknown,
+    its value does not fit, or the command line has options that PETSc was not given.
     """
     named = _without_prefix(given, prefix)
     database = PETSc.Options(prefix)

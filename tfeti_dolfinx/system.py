@@ -261,11 +261,7 @@ class System:
         return made(self._subdomains)
 
     def look_for_changes(self) -> None:
-        """See whether the mesh, or what forms, conditions and laws refer to, has changed.
-
-        Raise an InputError where Dirichlet conditions contradict each other, or a coefficient of
-        friction is negative or no number somewhere.
-        """
+        """See whether the mesh, or what forms, conditions and laws refer to, has changed."""
         changes = self.forms.changes() | self.tools.read(self.time)
         for what in (name for name in CHANGES if name in changes):
             self.change(what)

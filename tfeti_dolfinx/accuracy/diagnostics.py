@@ -19,7 +19,7 @@ from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mesh.untorn import cell_entities
+from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
@@ -57,22 +57,14 @@ def flatness(mesh: dmesh.Mesh) -> Array:
 
 
 def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
-    """Return pairs of bodies with nodes in common, and how many; the same on all ranks. Collective.
-
-    Shapes ``(p, 2)`` and ``(p,)``.
-    """
+    """Pairs of bodies with nodes in common, ``(p, 2)``, and how many, ``(p,)``. Collective."""
     comm, mesh = decomposition.comm, decomposition.mesh
     if decomposition.num_bodies == 1:
         return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64)
     geometry = geometry_dofmap(mesh)
     body = np.zeros(len(decomposition.original_nodes), dtype=np.int64)
     body[geometry] = decomposition.body_of_subdomain[decomposition.cell_subdomain][:, None]
-    fdim = mesh.topology.dim - 1
-    mesh.topology.create_connectivity(fdim, fdim + 1)
-    facets = decomposition.boundary
-    node = np.empty(0, dtype=np.int32)  # DOLFINx does not bear quadrilaterals without a cell
-    if len(facets):
-        node = np.unique(dmesh.entities_to_geometry(mesh, fdim, facets))
+    node = np.unique(facet_points(mesh, decomposition.boundary))
     ids = decomposition.original_nodes[node].astype(np.int64)
     exchange = Exchange(comm, ids % comm.size)
     met = np.stack((exchange.send(ids), exchange.send(body[node])), axis=1)

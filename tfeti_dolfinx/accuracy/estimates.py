@@ -61,12 +61,7 @@ class Estimates:
 
 
 def estimate(system: System, solution: Solution) -> Estimates:
-    """Estimate the errors of the last solution. Collective.
-
-    Raises:
-        InputError: The rows are no longer those of the solution.
-        FactorError: The stiffness inside of a subdomain could not be factored.
-    """
+    """Estimate the errors of the last solution. Collective."""
     if solution.gluing.constraints is not system.gluing.constraints:
         raise InputError(
             "estimate: the constraints are not those of the solution; expected a call after solve()"

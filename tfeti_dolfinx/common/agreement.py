@@ -53,10 +53,6 @@ def agreeing(comm: MPI.Intracomm, call: str) -> Iterator[dict[str, Any]]:
     communicate but by calls that begin like this one. An exception of any rank in it is raised on
     all: that of the lowest rank that has one.
 
-    Args:
-        comm: Communicator.
-        call: Name of the call.
-
     Raises:
         InputError: Another rank makes another call, or was given something else.
     """

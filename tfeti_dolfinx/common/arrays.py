@@ -189,10 +189,7 @@ def of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array, rows: int) -
 
 
 def node_blocks(K: Any, bs: int) -> Array:
-    """Return the ``bs × bs`` block of each node in a symmetric scipy matrix, shape ``(n, bs, bs)``.
-
-    Unknowns of a node follow each other.
-    """
+    """The ``bs × bs`` block of each node of a symmetric scipy matrix, shape ``(n, bs, bs)``."""
     n = K.shape[0]
     blocks = np.zeros((n // bs, bs, bs))
     for k in range(min(bs, n)):

@@ -159,10 +159,7 @@ class Description:
 
 
 def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:
-    """Return a field of a dataclass of parameters: its default, whose it is, what it does.
-
-    ``more`` is what else a ``Description`` has.
-    """
+    """Return a field of a dataclass of parameters, with its ``Description``."""
     return field(default=default, metadata={"is": Description(algorithm, text, **more)})
 
 

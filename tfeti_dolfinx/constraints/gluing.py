@@ -132,10 +132,7 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
 
 
 def check_conditions(conditions: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> None:
-    """Raise unless Dirichlet conditions are on V or a component of V, with unknowns of it.
-
-    Collective.
-    """
+    """Raise unless conditions are on V or a component of V, with unknowns of it. Collective."""
     count = np.zeros(len(conditions), dtype=np.int64)
     with raised_on_all_ranks(V.mesh.comm):
         for number, bc in enumerate(conditions):
@@ -256,10 +253,7 @@ class Gluing:
     slip: Array
 
     def right_side(self) -> Array:
-        """Return this rank's part of c, shape ``(num_rows,)``. Collective.
-
-        Raise a NoSolutionError where prescribed components alone violate a condition.
-        """
+        """Return this rank's part of c, shape ``(num_rows,)``. Collective."""
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
         held, left = self._held()
@@ -345,10 +339,7 @@ class Gluing:
         return start
 
     def contacts_of(self, rows: Array) -> list[int]:
-        """Positions, in the user's list, of the contacts that some local rows are of. Collective.
-
-        Equalities among them belong to none.
-        """
+        """Positions, in the user's list, of the contacts that local rows are of. Collective."""
         sets = self.constraints.sets
         normals = self.contact.condition[np.isin(sets.normals, rows)]
         tangents = self.tangents.condition[np.isin(sets.tangents, rows).any(axis=1)]

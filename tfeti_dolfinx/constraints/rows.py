@@ -177,10 +177,7 @@ class Constraints:
         return np.flatnonzero(np.any(self.coefficients > 0.0, axis=1))
 
     def with_pressures(self, pressures: Array) -> Constraints:
-        """Return the same rows with the ψ_i = μ_i λ_N,i of Coulomb's law; ∞ sticks.
-
-        λ_N are those of ``pressed``.
-        """
+        """The same rows with the ψ_i = μ_i λ_N,i of Coulomb's law, λ_N of ``pressed``; ∞ sticks."""
         at, limits = self.pressed, self.limits.copy()
         mu = self.coefficients[at]
         limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)

@@ -175,11 +175,7 @@ def with_friction(
 def friction_values(
     name: str, friction: FrictionLaw | None, records: ContactRecords, dofs: TornDofs
 ) -> Array:
-    """Bounds or coefficients of conditions along tangents, ``(n, gdim - 1)``, 0 without a law.
-
-    Raise an InputError where a value is negative or no number somewhere, or a function on another
-    mesh; the message begins with the contact's name. Collective.
-    """
+    """Bounds or coefficients along tangents, ``(n, gdim - 1)``, 0 without a law. Collective."""
     if friction is None:
         return np.zeros((len(records), dofs.bs - 1))
     x: Array = np.zeros((len(records), 3))

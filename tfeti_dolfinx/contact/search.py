@@ -71,10 +71,7 @@ class ContactSearch:
         return concatenate(self._records, self._dofs.bs)
 
     def friction(self) -> Array:
-        """Bounds or coefficients of all conditions along their tangents, 0 without friction.
-
-        Shape ``(n, gdim - 1)``. Raise an InputError where one is negative or no number.
-        """
+        """Bounds or coefficients along tangents, ``(n, gdim - 1)``, 0 without a law."""
         none = np.zeros((0, self._dofs.bs - 1))
         pairs = zip(self.contacts, self._records, strict=True)
         found = [friction_values(c.name, c.friction, records, self._dofs) for c, records in pairs]

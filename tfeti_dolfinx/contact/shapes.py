@@ -205,10 +205,7 @@ def check_shape(shape: Any, what: str) -> None:
 
 
 def distance_and_gradient(shape: Shape, x: Array, what: str) -> tuple[Array, Array]:
-    """Signed distance, ``(n,)``, and gradient, ``(n, 3)``, at points, ``(n, gdim)``.
-
-    Raise an InputError where a callable fails, or returns arrays of another shape.
-    """
+    """Signed distance, ``(n,)``, and gradient, ``(n, 3)``, at points, ``(n, gdim)``."""
     n, gdim = x.shape
     if n == 0:
         return np.zeros(0), np.zeros((0, 3))

@@ -182,10 +182,7 @@ class Tools:
         return found
 
     def take(self, values: Array) -> None:
-        """Take the unknowns of a solution, those of this rank. Collective.
-
-        Shape ``(num_local,)``.
-        """
+        """Take the unknowns of a solution, this rank's, shape ``(num_local,)``. Collective."""
         if self.num_unknowns:
             values = self._comm.bcast(values, root=self._comm.size - 1)
             self.found[:] = 0.0

@@ -38,10 +38,7 @@ _LINEAR_IN_ALL: set[str] = set()
 def displacement_space(
     a: ufl.Form, decomposition: Decomposition, name: str = "a"
 ) -> fem.FunctionSpace:
-    """Return the space of a bilinear form's trial and test functions. Collective.
-
-    Raise an InputError unless it is bilinear on one space for displacements on the torn mesh.
-    """
+    """Return the space of a bilinear form's trial and test functions. Collective."""
     with raised_on_all_ranks(decomposition.comm):
         test, trial = _argument_spaces(a, name, 2)
         check_space(test, decomposition)

@@ -81,8 +81,7 @@ def write_xdmf(
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.xdmf``, or the files cannot be written there, as
-            where the disk is full; then what was there before stays.
+        InputError: The name does not end with ``.xdmf``, else as for ``write_vtx``.
     """
     target = checked_target(path, ".xdmf", solution, interior)
     comm, mesh = solution.decomposition.comm, solution.decomposition.mesh
@@ -125,8 +124,7 @@ def write_pvd(
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.pvd``, or the files cannot be written there, as
-            where the disk is full; then what was there before stays.
+        InputError: The name does not end with ``.pvd``, else as for ``write_vtx``.
     """
     return _one_step(checked_target(path, ".pvd", solution, interior), solution, interior)
 
@@ -317,10 +315,7 @@ def nodal_fields(solution: Solution) -> list[fem.Function]:
 
 
 def cell_fields(solution: Solution) -> list[fem.Function]:
-    """Subdomain, body, material (-1 where a cell has no tag), and maybe the estimated error.
-
-    Collective.
-    """
+    """Subdomain, body, material (-1 without a tag), and maybe the estimated error. Collective."""
     decomposition = solution.decomposition
     subdomain = decomposition.cell_subdomain
     material = np.full(len(subdomain), NO_TAG)

@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.compat import original_cells
 from tfeti_dolfinx.common.parallel import Exchange
 from tfeti_dolfinx.common.validation import checked_callable, checked_type, is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.untorn import PhysicalNames
+from tfeti_dolfinx.mesh.untorn import PhysicalNames, facet_points
 
 # --- Functions on the mesh before and the torn one --------------------------------------------
 
@@ -106,10 +106,7 @@ def _owned_dofs(V: fem.FunctionSpace) -> Array:
 
 
 def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected: str) -> None:
-    """Raise an InputError unless tags are those of a mesh's cells, or of its facets.
-
-    Messages have the tags' name, and what is expected instead.
-    """
+    """Raise an InputError unless tags are those of a mesh's cells, or of its facets."""
     checked_type(tags, dmesh.MeshTags, what, "dolfinx.mesh.MeshTags")
     if tags.topology is not mesh.topology._cpp_object:
         raise InputError(f"{what} are tags of another mesh; {expected}")
@@ -262,12 +259,10 @@ class Decomposition:
         with agreeing(self.comm, "locate_facets") as given:
             given["marker"] = marker
             checked_callable(marker, "marker", "a function of points of shape (3, n)")
-        fdim, facets = self.mesh.topology.dim - 1, self.boundary.astype(np.int32)
-        self.mesh.topology.create_connectivity(fdim, fdim + 1)
+        facets, nodes = self.boundary.astype(np.int32), facet_points(self.mesh, self.boundary)
         with raised_on_all_ranks(self.comm):
-            if len(facets) == 0:  # DOLFINx divides by their number
+            if len(facets) == 0:
                 return facets
-            nodes = dmesh.entities_to_geometry(self.mesh, fdim, facets)
             used, corner = np.unique(nodes, return_inverse=True)
             with named("marker"):
                 flags = np.asarray(marker(self.mesh.geometry.x[used].T))

@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, is_whole, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names
-from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner, default_count
+from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner
 from tfeti_dolfinx.mesh.tearing import decomposed
 from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_facets
 
@@ -129,8 +129,6 @@ def decompose(
                 _names(mesh, facet_tags, surfaces), _names(mesh, cell_tags, volumes)
             ),
         )
-        if subdomains is None:
-            subdomains = default_count(untorn, mesh.comm)
         decomposition = decomposed(untorn, subdomains, partitioner, mesh.comm)
     return replace(decomposition, seconds=seconds, untorn=mesh)
 

@@ -30,7 +30,7 @@ from tfeti_dolfinx.mesh.gmsh_model import (
     physical_names,
     read_content,
 )
-from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner, default_count
+from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner
 from tfeti_dolfinx.mesh.tearing import decomposed
 from tfeti_dolfinx.mesh.untorn import (
     NO_TAG,
@@ -154,11 +154,6 @@ def untorn_mesh(
 
     ``contents`` is what this rank has read, maybe nothing; shared models may have nodes and facets
     in common with those of other ranks.
-
-    Raises:
-        InputError: There are no physical groups of cells, the cells are of several types or of
-            one that is not supported, plane cells do not lie in a plane, names contradict each
-            other, or the models do not fit together.
     """
     top = comm.allreduce(max((content.top for content in contents), default=0), op=MPI.MAX)
     with_cells = [content for content in contents if top in content.elements]
@@ -320,7 +315,6 @@ def read_gmsh(
                     with open_model(source) as model:
                         contents.append(read_content(model, "the mesh"))
         untorn, partitions = untorn_mesh(contents, comm, shared=bool(files))
-        if subdomains is None:
-            subdomains = default_count(untorn, comm) if partitions is None else partitions
+        subdomains = partitions if subdomains is None else subdomains
         decomposition = decomposed(untorn, subdomains, partitioner, comm, spread=not files)
     return replace(decomposition, seconds=seconds)

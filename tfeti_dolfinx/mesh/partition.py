@@ -96,49 +96,36 @@ def connected_parts(pieces: Pieces, absorb: bool) -> tuple[Array, dict[int, list
 # --- Assignment of cells to subdomains --------------------------------------------------------
 
 
-def default_count(mesh: UntornMesh, comm: MPI.Intracomm) -> int:
-    """Return the number of subdomains of about 4000 displacement unknowns each. Collective."""
-    per_cell = {"triangle": 0.5, "tetrahedron": 0.2}.get(mesh.cell_type.name, 1.0)
-    per_cell *= mesh.gdim * mesh.element.degree**mesh.gdim
-    return max(1, round(comm.allreduce(len(mesh.cells)) * per_cell / UNKNOWNS))
-
-
 def given_subdomains(mesh: UntornMesh, subdomains: Subdomains, comm: MPI.Intracomm) -> Array:
     """Subdomain of each local cell, numbered 0, 1, ... without holes. Collective.
 
     Given is one id per local cell; or a callable that gets cell midpoints, shape ``(3, n)``, and
     returns one id per cell. Raise an InputError where these are not whole numbers from 0 up.
     """
+    what = f"{'callable' if callable(subdomains) else 'array'} subdomains"
+    num_cells = len(mesh.cells)
     with raised_on_all_ranks(comm):
-        if callable(subdomains):
-            midpoints = np.zeros((3, len(mesh.cells)))
-            midpoints[: mesh.gdim] = mesh.midpoints().T
-            with named("callable subdomains"):
-                found = subdomains(midpoints)
-            ids = _checked_ids(found, len(mesh.cells), "callable subdomains")
-        else:
-            ids = _checked_ids(subdomains, len(mesh.cells), "array subdomains")
-    return without_holes(ids, comm)
-
-
-def _checked_ids(ids: ArrayLike, num_cells: int, what: str) -> Array:
-    with named(what):
-        array = np.asarray(ids)
-    if array.ndim == 0 or array.dtype.kind not in "biuf":
-        raise InputError(
-            f"{what}: expected a number of subdomains, one whole number for each cell or a "
-            f"callable that returns them, got {shown(ids)}"
-        )
-    if array.shape != (num_cells,):
-        raise InputError(
-            f"{what}: expected one id for each of the {num_cells} cells of this rank, "
-            f"got an array of shape {array.shape}"
-        )
-    whole = np.where(np.isfinite(array), array, -1).astype(np.int64)
-    if np.any(whole != array) or np.any(whole < 0):
-        wrong = array[(whole != array) | (whole < 0)][0]
-        raise InputError(f"{what}: expected whole numbers from 0 up, got {wrong}")
-    return whole
+        with named(what):
+            ids = subdomains
+            if callable(subdomains):
+                midpoints = np.zeros((3, num_cells))
+                midpoints[: mesh.gdim] = mesh.midpoints().T
+                ids = subdomains(midpoints)
+            array = np.asarray(ids)
+        if array.ndim == 0 or array.dtype.kind not in "biuf":
+            raise InputError(
+                f"{what}: expected a number of subdomains, one whole number for each cell or a "
+                f"callable that returns them, got {shown(ids)}"
+            )
+        if array.shape != (num_cells,):
+            raise InputError(
+                f"{what}: expected one id for each of the {num_cells} cells of this rank, "
+                f"got an array of shape {array.shape}"
+            )
+        whole = np.where(np.isfinite(array), array, -1).astype(np.int64)
+        if np.any(wrong := (whole != array) | (whole < 0)):
+            raise InputError(f"{what}: expected whole numbers from 0 up, got {array[wrong][0]}")
+    return without_holes(whole, comm)
 
 
 def without_holes(ids: Array, comm: MPI.Intracomm) -> Array:

@@ -19,6 +19,7 @@ from tfeti_dolfinx.mesh.cell_graph import CellGraph
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.partition import (
     DEFAULT,
+    UNKNOWNS,
     Subdomains,
     connected_parts,
     given_subdomains,
@@ -83,16 +84,21 @@ log = logging.getLogger(__name__)
 
 def decomposed(
     untorn: UntornMesh,
-    subdomains: Subdomains,
+    subdomains: Subdomains | None,
     partitioner: str,
     comm: MPI.Intracomm,
     spread: bool = False,
 ) -> Decomposition:
     """Tear a mesh into a number of subdomains, or those given for its cells. Collective.
 
-    ``spread`` shares out the cells among ranks at first, where one rank has read them.
+    None stands for subdomains of about 4000 displacement unknowns. ``spread`` shares out the cells
+    among ranks at first, where one rank has read them.
     """
     total = comm.allreduce(len(untorn.cells))
+    if subdomains is None:
+        per_cell = {"triangle": 0.5, "tetrahedron": 0.2}.get(untorn.cell_type.name, 1.0)
+        per_cell *= untorn.gdim * untorn.element.degree**untorn.gdim
+        subdomains = max(1, round(total * per_cell / UNKNOWNS))
     number = int(subdomains) if is_whole(subdomains) else 0
     if is_whole(subdomains) and not 1 <= number <= total:
         raise InputError(

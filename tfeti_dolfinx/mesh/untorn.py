@@ -77,6 +77,15 @@ def cell_facets(mesh: dmesh.Mesh) -> Array:
     return facets[: mesh.topology.index_map(tdim).size_local]
 
 
+def facet_points(mesh: dmesh.Mesh, facets: Array) -> Array:
+    """Geometry nodes of local facets, shape ``(n, nodes_per_facet)``."""
+    fdim = mesh.topology.dim - 1
+    mesh.topology.create_connectivity(fdim, fdim + 1)
+    if len(facets) == 0:  # DOLFINx divides by their number
+        return np.empty((0, 0), dtype=np.int32)
+    return np.asarray(dmesh.entities_to_geometry(mesh, fdim, facets.astype(np.int32)))
+
+
 # --- The untorn mesh --------------------------------------------------------------------------
 
 

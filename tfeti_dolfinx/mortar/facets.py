@@ -19,7 +19,7 @@ from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mesh.untorn import cell_facets
+from tfeti_dolfinx.mesh.untorn import cell_facets, facet_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Lagrange elements on facets --------------------------------------------------------------
@@ -266,10 +266,7 @@ def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
 
 
 def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, Array, Array]:
-    """Quadrature points of whole facets.
-
-    Return the facet of each point, reference coordinates of shape ``(m, tdim)``, weights.
-    """
+    """Return facet, reference coordinates, ``(m, tdim)``, and weight of quadrature points."""
     xi, w = basix.make_quadrature(getattr(basix.CellType, kind.hats.facet), degree)
     n, q = len(facets), len(w)
     slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), from_first(facets.x))
@@ -346,12 +343,7 @@ def group_points(dofs: TornDofs) -> Array:
 def extent(decomposition: Decomposition, facets: Array) -> float:
     """Return the length of the diagonal of the box of local facets of a surface. Collective."""
     mesh = decomposition.mesh
-    fdim = mesh.topology.dim - 1
-    mesh.topology.create_connectivity(fdim, mesh.topology.dim)
-    x = np.empty((0, 3))
-    if len(facets):  # DOLFINx divides by their number
-        nodes = dmesh.entities_to_geometry(mesh, fdim, facets.astype(np.int32))
-        x = mesh.geometry.x[np.unique(nodes)]
+    x = mesh.geometry.x[np.unique(facet_points(mesh, facets))]
     low, high = box_over_ranks(decomposition.comm, x)
     return float(np.linalg.norm(high - low))
 

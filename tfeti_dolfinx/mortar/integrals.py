@@ -265,10 +265,7 @@ def integrate(
 
 
 def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> MortarIntegrals:
-    """Return integrals of the multipliers over whole facets that face an obstacle.
-
-    ``distance`` is that of the obstacle at their vertices, shape ``(n, v)``.
-    """
+    """Return integrals over facets with an obstacle's distance at vertices, ``(n, v)``."""
     # exact for ψ_i φ_k on plane facets, and enough on curved ones
     facet, xi, weight = whole_facets(kind, facets, 4 * kind.displacement.degree)
     held = facets.held & (kind.displacement.degree > 1)

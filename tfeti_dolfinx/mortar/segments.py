@@ -27,11 +27,7 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
 def frames(normal: Array) -> Array:
-    """Right-handed orthonormal frames of unit normals: ``(n, gdim)`` to ``(n, gdim, gdim)``.
-
-    Axis 0 is the normal, then ``tangents``. They depend on the normal alone, so they are the same
-    on every rank.
-    """
+    """Right-handed frames of unit normals, normal first, then ``tangents``: ``(n, gdim, gdim)``."""
     return np.concatenate((normal[:, None], tangents(normal)), axis=1)
 
 

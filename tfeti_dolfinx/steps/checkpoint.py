@@ -111,10 +111,7 @@ class Checkpoint:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other runs out of the folder inside the block, while this process lives.
-
-        Raise an InputError where another run has it, or it is no folder for a checkpoint.
-        """
+        """Keep other runs out of the folder inside the block, while this process lives."""
         lock = None
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
             if self._comm.rank == 0:
@@ -172,16 +169,8 @@ class Checkpoint:
     ) -> None:
         """Keep a step; the one before is replaced when this one is whole.
 
-        Raise an InputError where the files cannot be written.
-
-        Args:
-            number: How many steps have converged.
-            about: What else to keep of it, for JSON; rank 0's counts.
-            record: What to keep of every step, likewise.
-            state: The state of this rank.
-            fields: Fields of the step on this rank, kept for all steps.
-            digest: Describes all that the user has given at this step, for JSON; empty where it
-                is not known. ``read`` gives it back. Rank 0's counts.
+        ``number`` steps have converged then. What is about it, its record and the digest, of what
+        the user has given, are for JSON, those of rank 0; state and fields are this rank's.
         """
         comm, in_state, in_fields = self._comm, "", ""
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):

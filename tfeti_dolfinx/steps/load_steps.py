@@ -276,9 +276,7 @@ class LoadSteps:
             given["resume"] = bool(resume)
             if resume and self._checkpoint is None:
                 raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
-        if self._series is not None:  # that an error of the user's has ended
-            self._series.drop()
-            self._series = None
+        self._close(drop=True)  # a file that an error of the user's has ended
         with nullcontext() if self._checkpoint is None else self._checkpoint.held():
             place = self._begin(resume)
             try:
@@ -460,13 +458,12 @@ class LoadSteps:
                     table = checkpoint.read_fields(kept, number)
                     self._write(record.time, in_order(table, here))
             except TfetiError:  # on all ranks
-                if self._series is not None:
-                    self._series.drop()
-                self._series = None
+                self._close(drop=True)
                 raise
         return place
 
-    def _close(self) -> None:
+    def _close(self, drop: bool = False) -> None:
+        """End the file of all steps: under its name, or not at all."""
         series, self._series = self._series, None
         if series is not None:
-            series.close()
+            (series.drop if drop else series.close)()

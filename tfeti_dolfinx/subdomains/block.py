@@ -310,8 +310,4 @@ class RigidBlock(Block):
         self.shares = np.ones(n)
         self.multiply = self.solve = self.apply_schur = np.zeros_like
         self.update(load)
-        self.set_stiffness(None)
-
-    def set_stiffness(self, K: Any) -> None:
-        """Take that there is none."""
-        self.kernel, self.diagonal = np.eye(len(self.load)), np.zeros(len(self.load))
+        self.kernel, self.diagonal = np.eye(n), np.zeros(n)

@@ -27,7 +27,6 @@ from tfeti_dolfinx.subdomains.block import (
     Block,
     OperatorKind,
     RigidBlock,
-    Springs,
     SubdomainData,
 )
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
@@ -81,7 +80,8 @@ class Subdomains:
         self.num_bodies, self.comm = num_bodies, comm
         own = max((block.modes.shape[1] for block in self.blocks), default=0)
         self.num_modes = int(comm.allreduce(own, op=MPI.MAX))
-        of_springs = [0 if own is None else len(own.stiffness) for own in self.springs]
+        springs = [block.springs for block in self.blocks]
+        of_springs = [0 if own is None else len(own.stiffness) for own in springs]
         self.spring_parts = parts_of(of_springs)
         self.num_springs = int(comm.allreduce(sum(of_springs)))
         self.dof_parts = parts_of([len(block.load) for block in self.blocks])
@@ -139,26 +139,21 @@ class Subdomains:
         return _assembled(parts, self.trace_parts, self.kernel_parts, shape)
 
     @property
-    def springs(self) -> list[Springs | None]:
-        """Those of each Block."""
-        return [block.springs for block in self.blocks]
-
-    @property
     def spring_rows(self) -> csr_array:
         """√D PᵀR of the springs, shape ``(k, r)``."""
         parts = [
             np.zeros((0, block.kernel.shape[1]))
-            if own is None
+            if (own := block.springs) is None
             else np.sqrt(own.stiffness)[:, None] * (own.stretches.T @ block.kernel)
-            for block, own in zip(self.blocks, self.springs, strict=True)
+            for block in self.blocks
         ]
         shape = sum(map(len, parts)), sum(part.shape[1] for part in parts)
         return _assembled(parts, self.spring_parts, self.kernel_parts, shape)
 
     def spring_motions(self, u: Array) -> Array:
         """√D Pᵀu of the springs, shape ``(k,)``, for u of shape ``(n,)``."""
-        pairs = zip(self.springs, self.dof_parts, strict=True)
-        found = [(own, u[part]) for own, part in pairs if own is not None]
+        pairs = zip(self.blocks, self.dof_parts, strict=True)
+        found = [(own, u[part]) for block, part in pairs if (own := block.springs) is not None]
         return joined([np.sqrt(own.stiffness) * (own.stretches.T @ v) for own, v in found])
 
     @property
