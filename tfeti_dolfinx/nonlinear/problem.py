@@ -204,7 +204,7 @@ class NonlinearContactProblem(ContactProblem):
                     f"Newton's method: after {step} steps {error}; or smaller load steps"
                 ) from error
             self._counts.newton_steps += 1
-            end = self._turned(u, np.array(self.u.x.array))
+            end = self._conforming(u, np.array(self.u.x.array))
             d = end - u
             size = largest(comm, d)
             increment = size / max(largest(comm, end), TINY) if size > self._last_digit else 0.0
@@ -243,17 +243,23 @@ class NonlinearContactProblem(ContactProblem):
             f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
         )
 
-    def _turned(self, u: Array, end: Array) -> Array:
-        """Let bodies that are let go turn by finite angles from u, not by small ones. Collective.
+    def _conforming(self, u: Array, end: Array) -> Array:
+        """Join the copies of nodes in finite strain, and let what is let go turn by finite angles.
 
-        Small ones stretch them, which would end the step early.
+        Rigid motions of copies that are apart stretch what glues them, and small turns stretch
+        bodies, which would end the step early. Collective.
         """
-        if not (self._finite and np.any(self._let_go)):
+        if not self._finite:
             return end
-        subdomains, bodies = self._system.subdomains, self._system.dual.coarse.bodies
-        motion = bodies.part_of(subdomains.with_rigid(self.dofs.to_primal(end - u)))
+        dofs, subdomains = self.dofs, self._system.subdomains
+        sums = dofs.reduce(dofs.to_primal(end).reshape(-1, dofs.bs), np.add)
+        end = dofs.to_dolfinx(dofs.spread(sums / dofs.multiplicity[:, None]))
+        if not np.any(self._let_go):
+            return end
+        bodies = self._system.dual.coarse.bodies
+        motion = bodies.part_of(subdomains.with_rigid(dofs.to_primal(end - u)))
         amounts = bodies.amounts(motion) * self._let_go[:, None]
-        return end + self.dofs.to_dolfinx(subdomains.turned_beyond(amounts))
+        return end + dofs.to_dolfinx(subdomains.turned_beyond(amounts))
 
     def _advice(self, d: Array) -> str:
         """Say what may help, from the derivative of F along the last step. Collective."""

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import norm_over, steering, summed
+from tfeti_dolfinx.common.parallel import dot_over, norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.qp.coarse import HELD
 from tfeti_dolfinx.qp.problem import QP
@@ -41,6 +41,7 @@ class FrictionParameters:
 
 
 DEFAULT = FrictionParameters()
+EPSILON = float(np.finfo(float).eps)
 
 # --- The law ----------------------------------------------------------------------------------
 
@@ -106,14 +107,16 @@ class LawProgram:
     def natural_map(self, at: LawPoint) -> tuple[FeasibleSet, Array, float]:
         """Return Ω(y_N⁺), p = P(y), and ‖F‖ times what λ misses of the law and of Gλ = e.
 
-        That is ‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks.
+        That is ‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks; but no less than what
+        rounding leaves of s, as of bodies that nothing holds and that have gone far away.
         """
         coarse, y = self.qp.coarse, at.lam - at.s / self.norm
         feasible = self.law.at(np.maximum(y[self.law.normals], 0.0))
         p = feasible.project(y)
         balancing = coarse.combined(coarse.solve(coarse.residual(at.lam)))
-        missed = norm_over(coarse.comm, np.concatenate((p - at.lam, balancing)))
-        return feasible, p, self.norm * missed
+        missed = np.concatenate((p - at.lam, balancing))
+        square, terms = dot_over(coarse.comm, (missed, missed), (at.s, at.s))
+        return feasible, p, max(self.norm * square**0.5, EPSILON * terms**0.5)
 
 
 # --- Newton's method --------------------------------------------------------------------------

@@ -364,13 +364,15 @@ class NewtonOnLaw:
         dual, parameters = self._dual, self._parameters
         if start is None or self.tries == 0 or bounds.stick:
             return None
+        rows, at = dual.constraints, dual.constraints.pressed
+        if not any_rank(dual.coarse.comm, start[0][rows.pressed_by[at]] > 0.0):
+            return None  # of a body that is let go there is nothing to find
         if self._rests:  # the same load again: the last bounds are right
             self._rests = False
             return None
         cite("newton on friction")
         dual.learn()  # steps differ by few rows, if by any
-        qp, rows, at = dual.qp(), dual.constraints, dual.constraints.pressed
-        normals, tangents = rows.pressed_by[at], rows.sets.tangents[at]
+        qp, normals, tangents = dual.qp(), rows.pressed_by[at], rows.sets.tangents[at]
         law = Law(lambda known: dual.law(rows.with_pressures(known)), normals, tangents)
         # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
         Fx = dual.last.image(qp.F, qp.coarse.comm, start[0]).Fx
