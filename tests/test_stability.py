@@ -170,6 +170,7 @@ def test_what_rounding_ends_is_called_so_with_all_warnings(name, cell, rtol, com
         known = "DIVERGED_ROUNDING" in row["error"] and "rounding does not let" in row["error"]
         assert known or (name == "flat block" and "DIVERGED_ITS" in row["error"])
         assert warnings_of("the flattest", row["warnings"])
+        assert name != "beam" or all(text in row["error"] for text in row["warnings"])
 
 
 def test_bodies_that_a_mesh_joins_in_nodes_alone_are_named(comm):
@@ -186,3 +187,12 @@ def test_atol_is_a_length():
     p.solve()
     assert p.report.converged_reason == "CONVERGED_ATOL"
     assert p.report.residuals["gluing_jump"] <= 2e-5
+
+
+def test_rtol_0_asks_for_all_digits(comm):
+    """Whether rounding is said to have ended it or not, it has them."""
+    options = {"tfeti_rtol": 0.0, "tfeti_error_if_not_converged": False}
+    row = run_scene(replace(rung("cells", "triangle", 1e4), options=options), comm)
+    if comm.rank == 0:
+        assert row["reason"] in ("CONVERGED_RTOL", "DIVERGED_ROUNDING")
+        assert row["u"] <= 1e-10

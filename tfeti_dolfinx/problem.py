@@ -309,10 +309,8 @@ class ContactProblem:
         if state is not None and state.loose.count > dual.coarse.free_motions.count:
             self._let_go = state.loose.moving
             if self._start is not None:  # forces that are the solver's error are no start
-                lam, rows = (
-                    np.array(solution.lam),
-                    np.append(dual.coarse.bounded, dual.coarse.rubbing),
-                )
+                rows = np.append(dual.coarse.bounded, dual.coarse.rubbing)
+                lam = np.array(solution.lam)
                 lam[rows[~state.active[rows]]] = 0.0
                 self._start = (gluing, lam, *end[2:])
         if options.warnings and state is not None:
