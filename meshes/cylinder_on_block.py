@@ -6,7 +6,8 @@ from typing import Any
 
 import gmsh
 
-from meshes.tools import graded_field, half_disc, started_model, use_sizes
+from meshes.half_cylinder import half_disc
+from meshes.tools import graded_field, started_model, use_sizes
 
 
 def build(

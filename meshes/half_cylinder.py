@@ -6,15 +6,10 @@ python3 meshes/half_cylinder.py half_cylinder.msh --partitions 8
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 import gmsh
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from meshes.tools import graded_size, half_disc, started_model
 
 
 def build(
@@ -36,18 +31,40 @@ def build(
         growth: Growth of the element size with the distance from that zone.
         partitions: Number of gmsh's partitions, 0 for none.
     """
-    model = started_model("half_cylinder")
+    if not gmsh.isInitialized():
+        gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    model = gmsh.model
+    model.add("half_cylinder")
     halves, arcs, top, axis = half_disc(model.geo, radius)
     model.geo.synchronize()
     model.addPhysicalGroup(2, halves, name="body")
     model.addPhysicalGroup(1, arcs, name="contact")
     model.addPhysicalGroup(1, top, name="top")
     model.addPhysicalGroup(1, [axis], name="axis")
-    graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
-    gmsh.model.mesh.generate(2)
+    excess = f"(sqrt(x^2+y^2)-{fine_radius})"
+    size = model.mesh.field.add("MathEval")
+    model.mesh.field.setString(size, "F", f"{fine}+{growth}*0.5*({excess}+fabs{excess})")
+    model.mesh.field.setAsBackgroundMesh(size)
+    for others in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
+        gmsh.option.setNumber(f"Mesh.MeshSize{others}", 0)
+    model.mesh.generate(2)
     if partitions > 1:
-        gmsh.model.mesh.partition(partitions)
+        model.mesh.partition(partitions)
     return model
+
+
+def half_disc(geo: Any, radius: float) -> tuple[list[int], list[int], list[int], int]:
+    """Both halves of x² + (y − R)² ≤ R², y ≤ R; arcs, flat top, and the axis between them."""
+    lowest, centre, right, left = (
+        geo.addPoint(x, y, 0.0)
+        for x, y in ((0.0, 0.0), (0.0, radius), (radius, radius), (-radius, radius))
+    )
+    axis = geo.addLine(lowest, centre)
+    arcs = [geo.addCircleArc(lowest, centre, right), geo.addCircleArc(left, centre, lowest)]
+    top = [geo.addLine(right, centre), geo.addLine(centre, left)]
+    loops = [arcs[0], top[0], -axis], [axis, top[1], arcs[1]]
+    return [geo.addPlaneSurface([geo.addCurveLoop(loop)]) for loop in loops], arcs, top, axis
 
 
 if __name__ == "__main__":

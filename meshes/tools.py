@@ -26,19 +26,6 @@ def started_model(name: str) -> Any:
     return gmsh.model
 
 
-def half_disc(geo: Any, radius: float) -> tuple[list[int], list[int], list[int], int]:
-    """Both halves of x² + (y − R)² ≤ R², y ≤ R; arcs, flat top, and the axis between them."""
-    lowest, centre, right, left = (
-        geo.addPoint(x, y, 0.0)
-        for x, y in ((0.0, 0.0), (0.0, radius), (radius, radius), (-radius, radius))
-    )
-    axis = geo.addLine(lowest, centre)
-    arcs = [geo.addCircleArc(lowest, centre, right), geo.addCircleArc(left, centre, lowest)]
-    top = [geo.addLine(right, centre), geo.addLine(centre, left)]
-    loops = [arcs[0], top[0], -axis], [axis, top[1], arcs[1]]
-    return [geo.addPlaneSurface([geo.addCurveLoop(loop)]) for loop in loops], arcs, top, axis
-
-
 def torn(comm: Any, build: Callable[[], Any], subdomains: int, order: int = 1) -> Any:
     """The torn mesh of a model that rank 0 builds, with cells of an order. Collective."""
     import tfeti_dolfinx as tfeti

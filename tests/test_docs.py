@@ -42,13 +42,10 @@ def commands():
 
 
 def run_elsewhere(command, folder):
-    """Outside of the tree, so that nothing is written into it; a demo stands there alone."""
-    environment = {**os.environ}
-    if demo := re.search(r"demos/(\w+)\.py", command):
-        (folder / "demos").mkdir()
-        _, environment = alone(demo[1], folder / "demos")
-    else:
-        (folder / "meshes").symlink_to(ROOT / "meshes")
+    """Outside of the tree, so that nothing is written into it; its program stands there alone."""
+    kind, name = re.search(r"(demos|meshes)/(\w+)\.py", command).groups()
+    (folder / kind).mkdir()
+    _, environment = alone(name, folder / kind, kind)
     process(shlex.split(command), folder, environment, 500)
 
 

@@ -323,7 +323,8 @@ class ContactProblem:
         method, notes = f"{options.qp_type} + {options.pc_type}", notes_of(outcome, solution)
         self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
         restless = [*d.body_names, *system.tools.free_names][settling.body]
-        conclude(result, accuracy, now, d.comm, excluding, restless, settling.slides, warnings)
+        said = [*warnings, *notes]
+        conclude(result, accuracy, now, d.comm, excluding, restless, settling.slides, said)
         return solution, accuracy.tolerances().jump
 
     def _log_warnings(self) -> None:
