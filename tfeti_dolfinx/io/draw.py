@@ -37,6 +37,7 @@ OBSTACLE = "grey"
 WIDTH = 0.84  # share of the scene; the scale has the rest
 FEW_CELLS = 3000  # whose edges do not hide the colours
 BEHIND = 1e-3  # of the scene
+CUT = 1e-4  # of the scene
 CORNER = 30.0  # degrees between facets that meet in an edge
 
 
@@ -80,7 +81,11 @@ def draw(data: Mapping[str, Any], target: str) -> None:
         factor = float(0.05 * size / max(np.abs(grid["u"]).max(), 1e-300))
     point, normal = data["cut"]
     if np.all(np.isfinite(normal)):
+        normal, off = normal / np.linalg.norm(normal), CUT * np.ptp(data["points"])
+        point = point - 2.0 * off * normal  # through no nodes, where VTK leaves holes
         grid = grid.clip(normal=normal, origin=point)
+        at_cut = (grid.points - point) @ normal > -off
+        grid[name] = np.where(at_cut & (name == "status"), max(STATUS) + 1, grid[name])
     bodies = grid.warp_by_vector("u", factor=factor)
     bodies.set_active_scalars(name)
     flat = bool(np.ptp(grid.points[:, 2]) == 0.0)
@@ -139,8 +144,9 @@ def _coloured(
         limits = None if np.isnan(highest) else [0.0, highest]
         return plotter.add_mesh(bodies, scalars=name, cmap=MAPS[name], clim=limits, **shade)
     surface = bodies.extract_surface().triangulate()
-    if name == "status":  # of a facet the least of its nodes
+    if name == "status":  # of a facet the least of its nodes, of which those at a cut have none
         of_cells = surface[name][surface.faces.reshape(-1, 4)[:, 1:]].min(axis=1).astype(int)
+        of_cells[of_cells > max(STATUS)] = 0
         colours, names = STATUS, STATUS_NAMES
     else:
         of_cells = surface.cell_data["body"].astype(int)

@@ -168,13 +168,13 @@ def conclude(
     excluding: Sequence[str] = (),
     restless: str = "",
     slides: str = "",
-    warnings: Sequence[str] = (),
+    said: Sequence[str] = (),
 ) -> None:
     """Say why the solver stopped, and raise where it should have gone on.
 
     ``excluding`` are names of the contacts whose rows exclude each other, or slip; ``restless`` is
     the body on which bounds of friction change most, ``slides`` says what friction does not hold;
-    an error says ``warnings``, too.
+    what is ``said`` of the answer, by warnings and notes, an error says, too.
     Raise a ConvergenceError where it stopped before its tolerance, unless options turn that off.
     """
     if result.reason > 0 and not options.converged_reason:
@@ -191,5 +191,4 @@ def conclude(
     if options.converged_reason and comm.rank == 0:
         print(f"TFETI solve {text}", flush=True)
     if result.reason <= 0 and options.error_if_not_converged:
-        hard = f"; warnings: {'; '.join(warnings)}" if warnings else ""
-        raise ConvergenceError(f"the dual solver stopped: {text}{hard}")
+        raise ConvergenceError("; ".join([f"the dual solver stopped: {text}", *said]))
