@@ -9,6 +9,7 @@ import re
 import shlex
 import shutil
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -263,6 +264,14 @@ def test_one_version():
     changes = re.search(r"^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     recipe = re.search(r'version: "(.*?)"', (ROOT / "environment/conda/recipe.yaml").read_text())
     assert citation[1] == changes[1] == recipe[1] == tfeti.__version__
+
+
+def test_conda_has_the_dependencies_of_the_package():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for name in ("environment.yml", "recipe.yaml"):
+        text = (ROOT / "environment/conda" / name).read_text()
+        for needed in project["dependencies"]:
+            assert f"- {needed.replace('>=', ' >=')}\n" in text, name
 
 
 def test_the_report_s_fields_are_documented():

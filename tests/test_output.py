@@ -1,6 +1,7 @@
 """Files for ParaView and pictures: complete, whole, and only when asked for."""
 
 import dolfinx
+import matplotlib.image
 import numpy as np
 import pytest
 from full_disk import full, left_in
@@ -173,13 +174,23 @@ def test_pictures(solution, comm, shared_tmp):
         plot_pressure(files[-1], solution, lambda x: x[:, 0])
     comm.barrier()
     if comm.rank == 0:
-        import matplotlib.image
-
         for file in files:
             picture = matplotlib.image.imread(file)[..., :3]
             assert picture.shape[0] > 300
             assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
         assert {p.name for p in shared_tmp.glob("*.png")} >= {f.name for f in files}
+
+
+def test_a_cut_makes_no_status(comm, shared_tmp):
+    """Between nodes that slip and others none touches without friction, which would be green."""
+    floor = tfeti.Obstacle("bottom", curved_obstacle(3), friction=tfeti.Tresca(1e-3))
+    p = problem(decomposed("tetrahedron", 4, 2), (0.0, 0.0, -0.05), [floor])
+    p.solve()
+    looks = {"cut": ((0.7, 0.0, 0.0), (-1.0, 0.0, 0.0)), "view": (-1.0, 0.2, -1.5)}
+    file = plot_deformed(shared_tmp / "cut.png", p.solution, show="status", **looks)
+    if comm.rank == 0:
+        r, g, b = matplotlib.image.imread(file)[..., :3].transpose(2, 0, 1)
+        assert not np.any((g > r + 0.1) & (g > b + 0.1))
 
 
 def test_a_colour_that_is_not_known_is_named(solution, shared_tmp):

@@ -322,9 +322,8 @@ class ContactProblem:
             warnings = self._diagnostics.found(dual, solution, outcome, options.number)
         method, notes = f"{options.qp_type} + {options.pc_type}", notes_of(outcome, solution)
         self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
-        restless = [*d.body_names, *system.tools.free_names][settling.body]
-        said = [*warnings, *notes]
-        conclude(result, accuracy, now, d.comm, excluding, restless, settling.slides, said)
+        body = [*d.body_names, *system.tools.free_names][settling.body]
+        conclude(result, accuracy, now, d.comm, excluding, body, settling.slides, warnings + notes)
         return solution, accuracy.tolerances().jump
 
     def _log_warnings(self) -> None:
