@@ -24,6 +24,9 @@ def test_contacts_none_of_which_touches_are_said(height):
         text = f"no contact touches (smallest gap {contact.gap:.2g}): the displacement is that "
         assert said == [f"{text}without contacts"]
         assert f"notes     {said[0]}" in str(p.report)
+        few = problem(d, contacts=[tfeti.Obstacle("bottom", plane, reach=1.0)], max_it=1)
+        with pytest.raises(tfeti.ConvergenceError, match=r"what rtol .*; no contact touches \(s"):
+            few.solve()
     else:
         assert p.report.contacts[0].touching > 0
         assert said == []

@@ -386,8 +386,8 @@ class NonlinearContactProblem(ContactProblem):
             t *= 0.5
         raise ConvergenceError(
             f"Newton's method: a step shortened to {t:.1e} still turns a cell inside out (det F "
-            "≤ 0), or gives a residual that is not finite; expected smaller load steps, tools outside "
-            "of bodies (is a normal turned?), and surfaces with the sides that roll onto a tool"
+            "≤ 0), or gives a residual that is not finite; expected smaller load steps, tools that "
+            "are outside (is a normal turned?), and surfaces with the sides that roll onto a tool"
         )
 
     def _slope(self, u: Array, d: Array, t: float) -> float:
