@@ -162,7 +162,7 @@ def prose(path):
 UNSAID = re.compile(
     r"\b(multiplications?|rows?|faces?(?! (away|each|them|it)\b)|dear(er)?|prices?|scenes?|hats?"
     r"|given (bounds?|friction)|(in|takes?) the place of|asks? for|the begin|about so many|beside"
-    r"|as ever|likewise|just if|right to)\b"
+    r"|as ever|likewise|just if|right to|so many|nobody|excludes? each other)\b"
 )
 
 

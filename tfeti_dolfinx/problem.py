@@ -251,7 +251,7 @@ class ContactProblem:
                     new = system.search.widen()
                 if new == 0:
                     if unmet := system.search.unmet():
-                        text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
+                        text = f"{error}; never in contact: {', '.join(unmet)}"
                         raise NoSolutionError(text) from error
                     raise
             else:

@@ -41,7 +41,7 @@ EXPLANATIONS = {
     "expected a smaller coefficient, smaller load steps, a larger friction_max_it, or a load that "
     "does not need bodies wedged between others",
     ConvergedReason.DIVERGED_CONTRADICTION: "; contact constraints that depend on each other "
-    "exclude each other{contacts}: expected gaps that some displacement keeps",
+    "contradict each other{contacts}: expected gaps that some displacement keeps",
 }
 # in the place of that of DIVERGED_FRICTION
 SLIDES = (
