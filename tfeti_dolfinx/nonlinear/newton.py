@@ -32,10 +32,10 @@ class NewtonTolerances:
             the last one: the slope along one step does not see all that is left. Nor does the end.
         flattest: And at most this: at that of a kept tangent a new one would be solved to more
             than it moves.
-        near: In small strain a linearised problem that comes within so many times ``rtol`` is the
+        near: In small strain a linearised problem that comes within this factor of ``rtol`` is the
             last but one, as a rule. In finite strain increments within it say nothing of
             ``turning``: they are what tolerances of linearised problems leave, too.
-        last: It is solved to so many times ``rtol``, which leaves little to the last one.
+        last: It is solved to this factor of ``rtol``, which leaves little to the last one.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
