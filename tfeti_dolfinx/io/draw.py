@@ -19,7 +19,7 @@ import numpy as np
 # in a field of its own, right of the scene
 SCALAR_BAR = {
     "vertical": True,
-    "position_x": 0.0,
+    "position_x": 0.08,
     "position_y": 0.2,
     "height": 0.6,
     "width": 0.5,
@@ -125,7 +125,7 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     if actor is not None:
         unit = str(data["unit"])
         title = "\n".join([*name.split(), f"[{unit}]" * bool(unit), ""])
-        look = SCALAR_BAR | {"title_font_size": 32 if len(max(title.split(), key=len)) < 7 else 22}
+        look = SCALAR_BAR | {"title_font_size": 32 if len(max(title.split(), key=len)) < 7 else 28}
         whole = {"fmt": "%.0f"} if 1e3 <= actor.mapper.scalar_range[1] < 1e5 else {}
         plotter.add_scalar_bar(title=title, mapper=actor.mapper, **look | whole)
     if factor != 1.0:
