@@ -289,11 +289,11 @@ def plot_friction(
             figure = Figure(figsize=(8, 5), layout="constrained")
             plot = figure.subplots()
             length = np.linalg.norm(arrows, axis=1)
-            size = np.quantile(length, 0.95) if len(x) else 0.0
-            if size > 0.0:
+            if np.any(length > 0.0):
+                size = np.quantile(length[length > 0.0], 0.8)
                 arrows = arrows / np.maximum(length / (2.0 * size), 1.0)[:, None]
                 scale = 14.0 * size / np.linalg.norm(np.ptp(x, axis=0))
-                look = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.0015}
+                look = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.003}
                 plot.quiver(*x.T, *arrows.T, **look)
                 plot.update_datalim(x + arrows / scale)
             for value, (name, colour) in STATUS.items():
