@@ -46,7 +46,7 @@ def run(name, folder):
 
 def alone(name, folder, kind="demos"):
     """Copy a program out of the tree: its path, and an environment that has the package alone."""
-    (folder / "site").mkdir()
+    (folder / "site").mkdir(parents=True)
     (folder / "site" / "tfeti_dolfinx").symlink_to(ROOT / "tfeti_dolfinx")
     path = Path(shutil.copy(ROOT / kind / f"{name}.py", folder))
     return path, {**os.environ, "PYTHONPATH": str(folder / "site")}

@@ -190,7 +190,7 @@ GIVEN_IN_WORDS = [
     r"a few thousand to millions",
     r"a tenth of the (estimated error|mesh's)",
     r"half the (square|step|error)",
-    r"so many times as long",
+    r"N times as long",
     r"a quarter of both",
     r"takes several times as many iterations",
 ]

@@ -182,15 +182,14 @@ def test_pictures(solution, comm, shared_tmp):
 
 
 def test_a_cut_makes_no_status(comm, shared_tmp):
-    """Between nodes that slip and others none touches without friction, which would be green."""
     floor = tfeti.Obstacle("bottom", curved_obstacle(3), friction=tfeti.Tresca(1e-3))
     p = problem(decomposed("tetrahedron", 4, 2), (0.0, 0.0, -0.05), [floor])
     p.solve()
-    looks = {"cut": ((0.7, 0.0, 0.0), (-1.0, 0.0, 0.0)), "view": (-1.0, 0.2, -1.5)}
-    file = plot_deformed(shared_tmp / "cut.png", p.solution, show="status", **looks)
+    looks = {"cut": ((0.7, 0, 0), (-1, 0, 0)), "view": (-1.0, 0.2, -1.5), "show": "status"}
+    file = plot_deformed(shared_tmp / "cut.png", p.solution, **looks)
     if comm.rank == 0:
         r, g, b = matplotlib.image.imread(file)[..., :3].transpose(2, 0, 1)
-        assert not np.any((g > r + 0.1) & (g > b + 0.1))
+        assert not np.any((g > r + 0.1) & (g > b + 0.1))  # as what touches without friction
 
 
 def test_a_colour_that_is_not_known_is_named(solution, shared_tmp):
