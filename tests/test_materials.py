@@ -11,7 +11,7 @@ from scenes import accepted, clamp, integral, unknowns
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
-from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
+from tfeti_dolfinx.nonlinear.forms import rotation_free_tangent
 
 E, NU = 1.0, 0.3
 PLASTIC = {"yield_stress": 0.02, "hardening": 0.1, "saturation": 0.01, "rate": 20.0}

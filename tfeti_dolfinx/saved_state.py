@@ -64,14 +64,8 @@ def labels_of_nodes(dofs: TornDofs) -> Array:
     return labels_of_dofs(cells, dofs.num_nodes, dofs.decomposition)
 
 
-def labels_of_conditions(gluing: Gluing, of_groups: Array) -> Array:
-    """Return labels of conditions, from those of the nodes of owned groups."""
-    group = of_groups[gluing.records.group]
-    return numbered(group >> SHIFT, group, gluing.records.contact)
-
-
-def labels_of_rows(gluing: Gluing, of_groups: Array) -> Array:
-    """Return labels of rows, from those of the nodes of owned groups.
+def labels_of_rows(gluing: Gluing, of_groups: Array) -> dict[str, Array]:
+    """Return labels of ``rows`` and ``conditions``, from those of the nodes of owned groups.
 
     Rows of a node: equalities as they stand, of each contact that along the normal, and those along
     the tangents.
@@ -79,8 +73,7 @@ def labels_of_rows(gluing: Gluing, of_groups: Array) -> Array:
     dofs, sets, records = gluing.dofs, gluing.constraints.sets, gluing.records
     copies = dofs.multiplicity[:, None]
     count = np.sum(np.where(gluing.prescribed.flag, copies, copies - 1), axis=1)
-    labels = np.empty(gluing.constraints.num_rows, dtype=np.int64)
-    group, kind, place = np.empty_like(labels), np.empty_like(labels), np.zeros_like(labels)
+    group, kind, place = np.zeros((3, gluing.constraints.num_rows), dtype=np.int64)
     group[sets.equalities] = np.repeat(of_groups, count)
     kind[sets.equalities] = -1
     place[sets.equalities] = np.arange(len(sets.equalities))
@@ -93,8 +86,9 @@ def labels_of_rows(gluing: Gluing, of_groups: Array) -> Array:
     group[sets.springs] = dofs.subdomains[sets.springs_of].astype(np.int64) << SHIFT
     kind[sets.springs] = -2
     place[sets.springs] = np.arange(len(sets.springs))
-    labels[:] = numbered(group >> SHIFT, group, kind, place)
-    return labels
+    rows = numbered(group >> SHIFT, group, kind, place)
+    group = of_groups[records.group]
+    return {"rows": rows, "conditions": numbered(group >> SHIFT, group, records.contact)}
 
 
 def labels_of_groups(dofs: TornDofs, of_nodes: Array) -> Array:
@@ -187,8 +181,7 @@ class SavedState:
             subdomains=solution.decomposition.subdomains.astype(np.int64) << SHIFT,
             layout=layout_of(solution.decomposition),
             nodes=nodes,
-            rows=labels_of_rows(gluing, of_groups),
-            conditions=labels_of_conditions(gluing, of_groups),
+            **labels_of_rows(gluing, of_groups),
             u=solution.u,
             lam=solution.lam,
             mu=mu,
@@ -238,11 +231,7 @@ class SavedState:
     def on_rows(self, gluing: Gluing) -> SavedState:
         """Return the state with rows and conditions in the order of a problem's. Collective."""
         of_groups = labels_of_groups(gluing.dofs, self.nodes)
-        here = {
-            "rows": labels_of_rows(gluing, of_groups),
-            "conditions": labels_of_conditions(gluing, of_groups),
-        }
-        records = gluing.records
+        here, records = labels_of_rows(gluing, of_groups), gluing.records
         with raised_on_all_ranks(gluing.dofs.comm):
             same = all(same_labels(getattr(self, kind), here[kind]) for kind in here)
             state = self._in_order(here) if same else self

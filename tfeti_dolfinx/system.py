@@ -361,8 +361,7 @@ class System:
         """Return the sizes, 0 before there are rows."""
         if self._gluing is None:
             return Sizes()
-        inside, unmet = self.elements.inside(), self.search.unmet()
-        return Sizes.of_rows(self._gluing, inside, unmet)
+        return Sizes.of_rows(self._gluing, self.elements.inside, self.search.unmet())
 
     def take_counts(self) -> StageCounts:
         """Return how often stages were made since the last call."""

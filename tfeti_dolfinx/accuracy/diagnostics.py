@@ -169,7 +169,7 @@ class Diagnostics:
             else stretch_over_shear(x, self._dofs.bs, block.multiply)
             for block, x in zip(subdomains.elastic, nodes, strict=True)
         ]
-        worst = subdomains.body_maxima([ratios])[0]
+        worst = subdomains.of_bodies([ratios], largest=True)[0]
         if np.any(worst > LIMITS.locks):
             t = float(worst.max())
             yield (
@@ -189,7 +189,7 @@ class Diagnostics:
         diagonal = joined([block.diagonal for block in subdomains.blocks])
         parts = subdomains.dof_parts
         squares = [sums(diagonal * of**2, parts) for of in (bent, u)]
-        energy, terms, moved = subdomains.body_sums([subdomains.energies(u), *squares])
+        energy, terms, moved = subdomains.of_bodies([subdomains.energies(u), *squares])
         # that of a body which only moves is rounding
         known = energy > EPSILON * np.maximum(energy, EPSILON * moved).max(initial=0.0)
         share = (
@@ -213,7 +213,7 @@ class Diagnostics:
         for (_, part), slope_of in zip(subdomains.elastic_parts, self._slopes, strict=True):
             slope = slope_of @ u[part].reshape(-1, bs)
             angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
-        worst = subdomains.body_maxima([angles])[0]
+        worst = subdomains.of_bodies([angles], largest=True)[0]
         turned = worst > LIMITS.turns
         if np.any(turned):
             yield (

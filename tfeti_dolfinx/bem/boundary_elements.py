@@ -18,7 +18,7 @@ from tfeti_dolfinx.forms.checks import is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.subdomains import FiniteElements, MakeBlock
+from tfeti_dolfinx.subdomains.subdomains import FiniteElements
 
 
 class BoundaryElements:
@@ -102,7 +102,9 @@ class BoundaryElementAssembly(FiniteElements):
     def node_blocks(self, K: Any, how: InverseFactory) -> Array:
         """Make S, and return the stiffness's block of each primal node."""
         self._made = Parts(self._dofs, self._decomposition, self._chosen, how)
-        return self._made.take_stiffness(K, super().node_blocks(K, how))
+        found = self._made.take_stiffness(K, super().node_blocks(K, how))
+        self.blocks, self.inside = self._made.blocks, self._made.inside()
+        return found
 
     @property
     def _parts(self) -> Parts:
@@ -122,16 +124,8 @@ class BoundaryElementAssembly(FiniteElements):
         replaced = self._parts.load(self._dofs.to_primal(forms.load()), of_volume, hats)
         return self._dofs.to_dolfinx(replaced)
 
-    def blocks(self, make_block: MakeBlock) -> MakeBlock:
-        """Return the factory of this rank's Blocks, those of finite elements as given."""
-        return self._parts.blocks(make_block)
-
     def solved(self, u: Array) -> BoundarySolution:
         """Return the solution, in primal order, inside boundary elements."""
         cells = self._decomposition.cell_subdomain
         have = self._chosen[np.searchsorted(self._dofs.subdomains, cells)]
         return BoundarySolution(self._parts.solved(u), np.flatnonzero(~have), cells)
-
-    def inside(self) -> int:
-        """Return the number of unknowns of all ranks that boundary elements do without."""
-        return self._parts.inside()

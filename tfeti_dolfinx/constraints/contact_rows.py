@@ -31,7 +31,8 @@ class RowBuilder:
         records: ContactRecords,
         rigid: RigidEntries | None = None,
     ) -> None:
-        self._rigid = rigid
+        none = np.zeros(0, dtype=np.int64)
+        self._rigid = rigid or RigidEntries(none, none, np.zeros((0, dofs.bs)))
         sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
         self.records, self._dofs, self._weights = records, dofs, weights
         self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
@@ -42,55 +43,44 @@ class RowBuilder:
         And the share of Σ_j |a_ij| along the axis that is not prescribed, free motions of rigid
         bodies included, which does not depend on stiffnesses. Shapes ``(n,)``.
         """
-        records, rigid = self.records, self._rigid
-        both = records.coefficients(axis), self._free(axis)
+        records, (*both, of_rigid) = self.records, self._along(axis)
         of_D = [np.sum(a**2 / self._total, axis=1) for a in both]
         terms = np.column_stack((*of_D, *(np.linalg.norm(a, axis=1) for a in both)))
         before, after, *moduli = sum_rows(records.condition, terms, len(records)).T
-        if rigid is not None:
-            for of in moduli:
-                np.add.at(of, rigid.condition, np.abs(self._along(axis)))
+        for of in moduli:
+            np.add.at(of, self._rigid.condition, np.abs(of_rigid))
         share = moduli[1] / np.maximum(moduli[0], TINY)
         return after, after > TOLERANCES.nothing_left**2 * before, share
 
     def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
         """Return a row for each of these conditions along an axis, times its scale."""
-        records, dofs = self.records, self._dofs
+        records, dofs, rigid = self.records, self._dofs, self._rigid
         place = np.full(len(records), -1)
         place[condition] = np.arange(len(condition))
         used = np.flatnonzero(place[records.condition] >= 0)
         entry, node, weight = dofs.lookup_copies(records.entry_group[used], self._weights)
         row = place[records.condition[used[entry]]]
-        shares = (self._free(axis) / self._total)[used[entry]]
+        _, free, of_rigid = self._along(axis)
+        shares = (free / self._total)[used[entry]]
         values = shares * weight * scale[row][:, None]
         columns = node[:, None] * dofs.bs + np.arange(dofs.bs)
-        of_nodes = Rows(
-            group=records.group[condition],
-            row=np.repeat(row, dofs.bs),
-            column=columns.ravel(),
-            value=values.ravel(),
-        )
-        rigid = self._rigid
-        if rigid is None:
-            return of_nodes
         of = np.flatnonzero(place[rigid.condition] >= 0)
-        row, along = place[rigid.condition[of]], self._along(axis)[of]
+        to = place[rigid.condition[of]]
         return Rows(
-            group=of_nodes.group,
-            row=np.concatenate((of_nodes.row, row)),
-            column=np.append(of_nodes.column, dofs.offsets[-1] * dofs.bs + rigid.unknown[of]),
-            value=np.append(of_nodes.value, along * scale[row]),
+            group=records.group[condition],
+            row=np.append(np.repeat(row, dofs.bs), to),
+            column=np.append(columns, dofs.offsets[-1] * dofs.bs + rigid.unknown[of]),
+            value=np.append(values, of_rigid[of] * scale[to]),
         )
 
-    def _along(self, axis: int) -> Array:
-        """Coefficients of the unknowns of rigid bodies along an axis of the frames."""
-        assert self._rigid is not None
-        frame = self.records.frame[self._rigid.condition, axis]
-        return np.asarray(np.sum(frame * self._rigid.direction, axis=1))
+    def _along(self, axis: int) -> tuple[Array, Array, Array]:
+        """Coefficients along an axis of the frames: all, and with 0 at prescribed components.
 
-    def _free(self, axis: int) -> Array:
-        """Coefficients along an axis of the frames, 0 at prescribed components."""
-        return np.where(self._prescribed, 0.0, self.records.coefficients(axis))
+        And those of the unknowns of rigid bodies.
+        """
+        given, rigid = self.records.coefficients(axis), self._rigid
+        own = np.sum(self.records.frame[rigid.condition, axis] * rigid.direction, axis=1)
+        return given, np.where(self._prescribed, 0.0, given), own
 
 
 # --- Non-penetration rows ---------------------------------------------------------------------

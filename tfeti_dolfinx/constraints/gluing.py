@@ -256,9 +256,9 @@ class Gluing:
         """Return this rank's part of c, shape ``(num_rows,)``. Collective."""
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
-        held, left = self._held()
+        held, left, rounding = self._held()
         decided, comm = left[normals.decided], self.dofs.comm
-        wrong = decided < -self._rounding()[normals.decided]
+        wrong = decided < -rounding[normals.decided]
         overlaps = comm.allreduce(int(np.sum(wrong)))
         deepest = comm.allreduce(float(decided.min(initial=0.0)), op=MPI.MIN)
         if overlaps:
@@ -278,19 +278,19 @@ class Gluing:
 
     def closed(self) -> Array:
         """Return the conditions that prescribed components decide and that touch. Collective."""
-        at, (_, left) = self.contact.decided, self._held()
-        return np.asarray(at[np.abs(left[at]) <= self._rounding()[at]])
+        at, (_, left, rounding) = self.contact.decided, self._held()
+        return np.asarray(at[np.abs(left[at]) <= rounding[at]])
 
-    def _held(self) -> tuple[Array, Array]:
-        """Return what prescribed components make of all v_i, and what that leaves of gaps."""
+    def _held(self) -> tuple[Array, Array, Array]:
+        """Return what prescribed components make of all v_i, and what that leaves of gaps.
+
+        And the slack of these: facets of curved surfaces may overlap where bodies do not.
+        """
         records = self.records
         held = relative_motion(records, self.dofs, self.prescribed.value) - records.motion
-        return held, records.gap - np.sum(records.normal * held, axis=1)
-
-    def _rounding(self) -> Array:
-        """Slack of gaps, since facets of curved surfaces may overlap where bodies do not."""
-        curved = 2.0 * np.abs(self.records.curved_gap - self.records.geometric_gap)
-        return np.asarray(curved + TOLERANCES.overlap * self.length)
+        left = records.gap - np.sum(records.normal * held, axis=1)
+        curved = 2.0 * np.abs(records.curved_gap - records.geometric_gap)
+        return held, left, curved + TOLERANCES.overlap * self.length
 
     def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
         """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.

@@ -26,7 +26,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
     Facets,
     diameter,
-    extent,
     facet_kind,
     group_points,
     hat_areas,
@@ -88,7 +87,7 @@ class ContactPartner(ABC):
         except InputError as error:  # on all ranks
             raise InputError(f"{self.name}: {error}") from error
         self._check_gap()
-        size, reach = min(extent(decomposition, surface) for surface in facets), self.reach
+        size, reach = min(diameter(decomposition, surface) for surface in facets), self.reach
         if reach is None:
             return SEARCH.reach * size
         if not isinstance(reach, Real) or isinstance(reach, bool) or not reach > 0.0:

@@ -11,7 +11,7 @@ from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.parallel import Exchange, largest, owner_of, summed
+from tfeti_dolfinx.common.parallel import largest, summed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import Facets, hat_integrals
 from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals, Triplets
@@ -213,9 +213,8 @@ def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
     """Return triplets on the ranks that own their rows (as local slots), equal ones added up."""
     row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
-    exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, row))
-    total = dofs.group_offsets[-1]
-    row, column = exchange.send(row) - dofs.group_offsets[dofs.comm.rank], exchange.send(column)
+    exchange, row = dofs.owners_of(row)
+    column, total = exchange.send(column), dofs.group_offsets[-1]
     place, which = np.unique(total * row + column, return_inverse=True)
     return *np.divmod(place, total), sum_rows(which, exchange.send(value), len(place))
 

@@ -16,7 +16,7 @@ from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.rigid_body import MOTIONS, Pose, RigidBody, motion_fields
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import extent, surface_facets
+from tfeti_dolfinx.mortar.facets import diameter, surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
@@ -75,7 +75,7 @@ class Tools:
             tool = contact.shape
             if dofs.bs != gdim or gdim == 1:
                 raise InputError(f"{contact.name}: a RigidBody needs displacements in 2D or 3D")
-            size = extent(decomposition, surface_facets(decomposition, contact.surface))
+            size = diameter(decomposition, surface_facets(decomposition, contact.surface))
             if tool not in known:
                 known.append(tool)
                 name = tool.name or f"tool of surface {contact.surface!r}"

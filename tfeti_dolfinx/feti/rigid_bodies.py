@@ -345,7 +345,7 @@ class Bodies:
         subdomains, own = self._subdomains, self._subdomains.load_rounding
         squares = [[float(block.load @ block.load) for block in subdomains.blocks]]
         squares += [[float(own[part] @ own[part]) for part in subdomains.dof_parts]]
-        self.loads, noise = np.sqrt(subdomains.body_sums(squares))
+        self.loads, noise = np.sqrt(subdomains.of_bodies(squares))
         largest, noise = self.loads * np.sqrt(self.nodes), noise * np.sqrt(self.nodes)
         self.unloaded = np.maximum(noise, TOLERANCES.rounding * largest)
         others = np.maximum(noise, TOLERANCES.rounding * largest.max(initial=0.0))

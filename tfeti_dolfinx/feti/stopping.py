@@ -118,7 +118,7 @@ def measure(
     if len(sets.springs):
         ends = sums(dual.coarse.sigma * w[sets.springs] ** 2, subdomains.spring_parts)
         closing = [a + b for a, b in zip(closing, ends, strict=True)]
-    energies, correction_energies, stiffness = subdomains.body_sums(
+    energies, correction_energies, stiffness = subdomains.of_bodies(
         [subdomains.energies(u), closing, sums(diagonal, trace)]
     )
     displacements = (

@@ -141,10 +141,6 @@ class Inertia:
             raise InputError("the step has no size yet; expected a call of take_step(size) before")
         return 2.0 / self.motion.size**2
 
-    def stiffness(self, K: csr_array) -> Any:
-        """Return K/2 + 2M/τ²."""
-        return 0.5 * K + self.share * self.M
-
     def move(self, u: Array, v: Array, load: Array | None = None) -> None:
         """Let the next step begin at a displacement and a velocity, and with the last load."""
         motion = self.motion
@@ -183,7 +179,7 @@ class InertialForms(Forms):
 
     def stiffness(self) -> Any:
         """Return this rank's K/2 + 2M/τ²."""
-        return self.inertia.stiffness(self.K)
+        return 0.5 * self.K + self.inertia.share * self.inertia.M
 
     def load(self) -> Array:
         """Return this rank's f + 2Mw/τ² − Ku/2."""

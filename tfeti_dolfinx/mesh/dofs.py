@@ -177,7 +177,7 @@ class TornDofs:
 
     def lookup(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
         """Rows for any groups, ``(k,)``, of tables with a row per owned group. Collective."""
-        exchange, asked = self._to_owners_of(groups)
+        exchange, asked = self.owners_of(groups)
         return tuple(exchange.answer(table[asked]) for table in tables)
 
     def reduce_on_owners(
@@ -187,13 +187,16 @@ class TornDofs:
 
         ``op`` is as in ``reduce``, ``initial`` its neutral element. Collective.
         """
-        exchange, slot = self._to_owners_of(groups)
+        exchange, slot = self.owners_of(groups)
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
         op.at(out, slot, exchange.send(values))
         return out
 
-    def _to_owners_of(self, groups: Array) -> tuple[Exchange, Array]:
-        """Return the exchange with the owners of groups, and which of theirs are asked for."""
+    def owners_of(self, groups: Array) -> tuple[Exchange, Array]:
+        """Return the exchange with the owners of groups, and which of theirs it asks. Collective.
+
+        Those are positions among the groups that this rank owns, one for each row received.
+        """
         exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
         return exchange, exchange.send(groups) - self.group_offsets[self.comm.rank]
 

@@ -109,7 +109,7 @@ def given_subdomains(mesh: UntornMesh, subdomains: Subdomains, comm: MPI.Intraco
             ids = subdomains
             if callable(subdomains):
                 midpoints = np.zeros((3, num_cells))
-                midpoints[: mesh.gdim] = mesh.midpoints().T
+                midpoints[: mesh.x.shape[1]] = mesh.midpoints().T
                 ids = subdomains(midpoints)
             array = np.asarray(ids)
         if array.ndim == 0 or array.dtype.kind not in "biuf":

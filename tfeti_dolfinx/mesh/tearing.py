@@ -97,7 +97,8 @@ def decomposed(
     total = comm.allreduce(len(untorn.cells))
     if subdomains is None:
         per_cell = {"triangle": 0.5, "tetrahedron": 0.2}.get(untorn.cell_type.name, 1.0)
-        per_cell *= untorn.gdim * untorn.element.degree**untorn.gdim
+        gdim = untorn.x.shape[1]
+        per_cell *= gdim * untorn.element.degree**gdim
         subdomains = max(1, round(total * per_cell / UNKNOWNS))
     number = int(subdomains) if is_whole(subdomains) else 0
     if is_whole(subdomains) and not 1 <= number <= total:

@@ -113,11 +113,6 @@ class UntornMesh:
     names: PhysicalNames  # names of the physical groups, the same on all ranks
 
     @property
-    def gdim(self) -> int:
-        """Geometric dimension."""
-        return self.x.shape[1]
-
-    @property
     def vertices(self) -> Array:
         """Vertices among the nodes of each cell, shape ``(n, vertices_per_cell)``."""
         return self.cells[:, : len(cell_entities(self.cell_type, 0))]

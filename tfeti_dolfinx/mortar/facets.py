@@ -65,11 +65,6 @@ class FacetElement:
         return self._element.tabulate(1, np.ascontiguousarray(xi))[1:, :, :, 0]
 
 
-def from_first(x: Array) -> Array:
-    """Return nodes of facets from the first one on: rounding turns none that is far from 0."""
-    return np.asarray(x - x[:, :1])
-
-
 # --- Facets of contact surfaces ---------------------------------------------------------------
 
 
@@ -214,7 +209,8 @@ def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array
 
 def _normals(element: FacetElement, x: Array, xi: Array) -> Array:
     """Normals at reference points, as long as area per area there, shape ``(points, n, gdim)``."""
-    tangents = np.einsum("tvg,ngd->tvnd", element.slopes(xi), from_first(x))
+    # from the first node on: rounding turns no facet that is far from 0
+    tangents = np.einsum("tvg,ngd->tvnd", element.slopes(xi), x - x[:, :1])
     if len(tangents) == 1:
         return np.stack((tangents[0, :, :, 1], -tangents[0, :, :, 0]), axis=2)
     return np.cross(*tangents)
@@ -236,8 +232,8 @@ def points(element: FacetElement, x: Array, xi: Array) -> Array:
 
 def densities(element: FacetElement, x: Array, xi: Array) -> Array:
     """Area per area of the reference facet, shape ``(m,)``; arguments as of ``points``."""
-    nodes = from_first(x[:, : element.size])
-    return _areas(np.einsum("tmv,mvd->mtd", element.slopes(xi), nodes))
+    nodes = x[:, : element.size]
+    return _areas(np.einsum("tmv,mvd->mtd", element.slopes(xi), nodes - nodes[:, :1]))
 
 
 def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
@@ -269,7 +265,8 @@ def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, A
     """Return facet, reference coordinates, ``(m, tdim)``, and weight of quadrature points."""
     xi, w = basix.make_quadrature(getattr(basix.CellType, kind.hats.facet), degree)
     n, q = len(facets), len(w)
-    slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), from_first(facets.x))
+    nodes = facets.x - facets.x[:, :1]
+    slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), nodes)
     weight = _areas(slopes.reshape(n * q, *slopes.shape[2:])) * np.tile(w, n)
     return np.repeat(np.arange(n), q), np.tile(xi, (n, 1)), weight
 
@@ -340,15 +337,10 @@ def group_points(dofs: TornDofs) -> Array:
     return dofs.reduce(dofs.points(), np.minimum)
 
 
-def extent(decomposition: Decomposition, facets: Array) -> float:
-    """Return the length of the diagonal of the box of local facets of a surface. Collective."""
-    mesh = decomposition.mesh
-    x = mesh.geometry.x[np.unique(facet_points(mesh, facets))]
+def diameter(decomposition: Decomposition, facets: Array | None = None) -> float:
+    """Return the diagonal of the box of local facets, or of the mesh, a length. Collective."""
+    mesh, x = decomposition.mesh, decomposition.mesh.geometry.x
+    if facets is not None:
+        x = x[np.unique(facet_points(mesh, facets))]
     low, high = box_over_ranks(decomposition.comm, x)
-    return float(np.linalg.norm(high - low))
-
-
-def diameter(decomposition: Decomposition) -> float:
-    """Return the length of the diagonal of the mesh's box. Collective."""
-    low, high = box_over_ranks(decomposition.comm, decomposition.mesh.geometry.x)
     return float(np.linalg.norm(high - low))

@@ -8,7 +8,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.parallel import Exchange, any_rank, owner_of
+from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points, whole_facets
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments, tangents
@@ -36,8 +36,8 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
     axes = tangents(normals.reshape(-1, gdim)).reshape(n, v, gdim - 1, gdim)
     M, b = _normal_equations(facets.corners, normals, axes)
     sharp = (cosine <= SEARCH.edge).astype(float)
-    exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, groups))
-    vertex, place = np.unique(exchange.send(groups), return_inverse=True)
+    exchange, asked = dofs.owners_of(groups)
+    vertex, place = np.unique(asked, return_inverse=True)
     M, b, sharp = (
         sum_rows(place, exchange.send(part.reshape(n * v, *part.shape[2:])), len(vertex))
         for part in (M, b, sharp)

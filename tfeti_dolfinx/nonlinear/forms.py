@@ -13,6 +13,7 @@ from dolfinx import fem, la
 from mpi4py import MPI
 from scipy.sparse import csr_array
 from ufl.algorithms import expand_derivatives
+from ufl.constantvalue import Zero
 from ufl.corealg.traversal import unique_pre_traversal
 
 from tfeti_dolfinx.common.arrays import Array
@@ -42,6 +43,44 @@ def dead_loads(F: ufl.Form, u: fem.Function) -> ufl.Form:
         if not any(isinstance(x, ufl.classes.Derivative) or x == u for x in unique_pre_traversal(e))
     ]
     return ufl.Form(dead)
+
+
+def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
+    """Return a tangent of a residual whose kernel are the rigid motions about X + u.
+
+    With F = I + ∇u, the first Piola–Kirchhoff stress P and S = F⁻¹P the tangent along w has a
+    material part, ∫E(w) : C : E(v), E(w) = sym(Fᵀ∇w), and a geometric one, ∫∇w S : ∇v = ∫P : Aᵀ∇v,
+    A = ∇w F⁻¹. A body under stress resists rotations by the latter, so the whole has a smaller
+    kernel, and is often indefinite. Here F⁻ᵀE(w) and F⁻ᵀE(v) take the place of ∇w and ∇v in the
+    geometric part: what stretches a body is as stiff as it is, and rotations, E = 0, cost nothing.
+    Forces on facets that turn with the body have no part in it.
+
+    Args:
+        F: Residual, linear in its test function, for instance ∫P(u):∇v dx less that of loads.
+        u: The displacement.
+    """
+    F = expand_derivatives(F)
+    (v,) = F.arguments()
+    w = ufl.TrialFunction(u.function_space)
+    inside = ufl.Form([i for i in F.integrals() if i.integral_type() == "cell"])
+    on_facets = [
+        i
+        for i in F.integrals()
+        if i.integral_type() != "cell"
+        and not any(e == ufl.grad(u) for e in unique_pre_traversal(i.integrand()))
+    ]
+    tangent = ufl.derivative(ufl.Form([*inside.integrals(), *on_facets]), u, w)
+    deformation = ufl.Identity(len(u)) + ufl.grad(u)
+    inverse = ufl.inv(deformation)
+
+    def stretched(y: Any) -> Any:
+        return inverse.T * ufl.sym(deformation.T * ufl.grad(y))
+
+    # F is linear in ∇v: the difference of both geometric parts is that of one gradient; v itself,
+    # as body forces have it, has none
+    gradient = (stretched(w) * inverse).T * stretched(v) - (ufl.grad(w) * inverse).T * ufl.grad(v)
+    change = {ufl.grad(v): expand_derivatives(gradient), v: Zero(v.ufl_shape)}
+    return tangent + ufl.replace(inside, change)
 
 
 class NewtonForms(Forms):
@@ -111,12 +150,6 @@ class NewtonForms(Forms):
         with self._in_place():
             return fem.assemble_vector(self._dead).array
 
-    def tangent_times(self, d: Array) -> Array:
-        """Return this rank's J(u) d."""
-        with self._in_place():
-            matrix = super().stiffness()
-        return np.asarray(matrix @ d[: matrix.shape[1]])
-
     def residual(self) -> Array:
         """Return this rank's F(u)."""
         with self._in_place():
@@ -159,12 +192,8 @@ class InertialNewtonForms(NewtonForms):
         """Return this rank's J/2 + 2M/τ²."""
         J = super().stiffness()
         with self._in_place():
-            self._matrix = self.inertia.stiffness(J)
+            self._matrix = 0.5 * J + self.inertia.share * self.inertia.M
         return self._matrix
-
-    def tangent_times(self, d: Array) -> Array:
-        """Return this rank's (J/2 + 2M/τ²) d."""
-        return 0.5 * super().tangent_times(d) + self.inertia.share * (self.inertia.M @ d)
 
     def residual(self) -> Array:
         """Return this rank's R(u); F(u) before the step has a size."""
@@ -205,13 +234,11 @@ class CurrentPlaces:
         self._det = fem.Expression(det, points)
         self._cells = np.arange(len(cells), dtype=np.int32)
 
-    def look(self) -> None:
-        """Take the places of u as it is now."""
-        self._here = np.array(self._u.x.array)
-
-    def move(self) -> None:
-        """Put mesh and nodes to X + u, u as ``look`` has last found it."""
+    def move(self, anew: bool) -> None:
+        """Put mesh and nodes to X + u, u as it is now, else as it was the last time."""
         gdim = self._mesh.geometry.dim
+        if anew:
+            self._here = np.array(self._u.x.array)
         self._moving.x.array[:] = self._here
         self._at_points.interpolate(self._moving)
         moved = self._at_points.x.array.reshape(-1, gdim)

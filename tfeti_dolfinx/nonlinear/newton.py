@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from mpi4py import MPI
@@ -91,60 +91,62 @@ class NewtonTolerances:
     alike: float = 1e-6
 
 
+@dataclass
 class ModelKeeping:
     """Decides whether the next linearised problem has the model of the last one.
 
-    That is J with its factors, and in finite strain the rows of the same places, too. ``kept``:
-    whether the present model is that of the linearised problem before.
+    That is J with its factors, and in finite strain the rows of the same places, too.
     """
 
-    def __init__(self, tolerances: NewtonTolerances, finite: bool) -> None:
-        self._tolerances, self._finite, self._freezes = tolerances, finite, True
-        self.begin()
+    tolerances: NewtonTolerances
+    finite: bool
+    freezes: bool = True  # whether places are kept: until bodies turn while they are
+    kept: bool = False  # whether the present model is that of the linearised problem before
+    # increments: the first of a load step, the first of a model, and the last one
+    first: float = 0.0
+    of_model: float = 0.0
+    before: float = 0.0
 
     def begin(self) -> None:
         """Begin a load step with a new model."""
-        self.kept, self._first, self._of_model, self._before = False, 0.0, 0.0, 0.0
+        self.kept, self.first, self.of_model, self.before = False, 0.0, 0.0, 0.0
 
     def next(self, size: float, t: float, near: float) -> bool:
         """Return whether to keep the model after an increment and its length t.
 
         Increments up to ``near`` are near the tolerance.
         """
-        tol = self._tolerances
-        self._first, slow = self._first or size, self.kept and size > tol.slow * self._before
-        if self._finite:
+        tol = self.tolerances
+        self.first, slow = self.first or size, self.kept and size > tol.slow * self.before
+        if self.finite:
             if not self.kept:
-                turns = self._of_model > 0.0 and size > max(tol.turning * self._of_model, near)
-                self._freezes, self._of_model = self._freezes and not turns, size
-            good = self._freezes and (not self.kept or size > tol.frozen * self._of_model)
+                turns = self.of_model > 0.0 and size > max(tol.turning * self.of_model, near)
+                self.freezes, self.of_model = self.freezes and not turns, size
+            good = self.freezes and (not self.kept or size > tol.frozen * self.of_model)
         else:
-            good = size <= tol.settled * self._first
-        self.kept, self._before = good and t == 1.0 and not slow, size
+            good = size <= tol.settled * self.first
+        self.kept, self.before = good and t == 1.0 and not slow, size
         return self.kept
 
 
+@dataclass
 class Anderson:
     """Anderson's acceleration of u ← u + d: the last differences of d in least squares."""
 
-    def __init__(self, tolerances: NewtonTolerances, comm: MPI.Intracomm) -> None:
-        self._depth, self._rcond, self._comm = tolerances.anderson, tolerances.dependent, comm
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget the iterates so far."""
-        self._steps: list[Array] = []
-        self._places: list[Array] = []
+    tolerances: NewtonTolerances
+    comm: MPI.Intracomm
+    past: list[tuple[Array, Array]] = field(default_factory=list)  # u and d of the last iterates
 
     def next(self, u: Array, d: Array) -> Array:
         """Return the next iterate after u, whose step is d. Collective."""
         end = moved = u + d
-        if self._steps:
-            steps = d[:, None] - np.array(self._steps).T
-            gram = summed(self._comm, steps.T @ np.column_stack((steps, d)))
-            gram = bcast_from_root(self._comm, gram)
-            share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=self._rcond)[0]
-            moved = end - (u[:, None] - np.array(self._places).T + steps) @ share
-        self._steps = [*self._steps, d][-self._depth :]
-        self._places = [*self._places, u][-self._depth :]
+        if self.past:
+            places, steps = (np.array(known).T for known in zip(*self.past, strict=True))
+            steps = d[:, None] - steps
+            gram = summed(self.comm, steps.T @ np.column_stack((steps, d)))
+            gram = bcast_from_root(self.comm, gram)
+            rcond = self.tolerances.dependent
+            share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=rcond)[0]
+            moved = end - (u[:, None] - places + steps) @ share
+        self.past = [*self.past, (u, d)][-self.tolerances.anderson :]
         return moved

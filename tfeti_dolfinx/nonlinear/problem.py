@@ -26,10 +26,9 @@ from tfeti_dolfinx.errors import (
 )
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
-from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
+from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms, rotation_free_tangent
 from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonTolerances
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue, check_state
-from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
 from tfeti_dolfinx.solution import Solution
@@ -228,12 +227,12 @@ class NonlinearContactProblem(ContactProblem):
             if step == 0:  # what conditions prescribe is met from then on
                 self._last_increment = min(increment, self._loosest)
             if t < 1.0:
-                faster.forget()  # a model that does not hold along d tells nothing of the next
+                faster.past.clear()  # a model that does not hold along d tells nothing of the next
             plain = t < 1.0 or step == 0 or not (self._finite or forms.kept)
             if not plain:  # else the line search has ended there
                 self._set(faster.next(u, d))
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
-                    faster.forget()
+                    faster.past.clear()
                     self._set(u + d)
             keeps = keeping.next(size, t, tol.near * exact * largest(comm, end))
             # old places leave a body that is let go a moment, which drives it
@@ -270,7 +269,7 @@ class NonlinearContactProblem(ContactProblem):
             / largest(self.decomposition.comm, d)
         )
         before = forms.residual()
-        along = forms.tangent_times(d)
+        along = forms.stiffness() @ d
         self._set(u + h * d)
         apart = (forms.residual() - before) / h - along
         off, size = np.sqrt(self._total(np.array([apart @ apart, along @ along])))
@@ -331,10 +330,9 @@ class NonlinearContactProblem(ContactProblem):
 
     def _go_to_places(self, places: CurrentPlaces) -> None:
         """Let contact and rigid motions be those of X + u. Collective."""
+        places.move(anew=not self._newton_forms.kept)
         if not self._newton_forms.kept:
-            places.look()
             self._system.origin = self.dofs.to_primal(self.u.x.array)
-        places.move()
         self._system.begin_at(self.dofs.to_primal(self._begin))
 
     def _set(self, u: Array) -> None:

@@ -42,6 +42,9 @@ class InternalVariables:
             expression of its new value, in terms of the displacement and of old values, or a
             callable without arguments that returns the new ``x.array``.
         mesh: The torn mesh.
+
+    Attributes:
+        functions: The functions, in the order in which they were given.
     """
 
     def __init__(self, given: Mapping[fem.Function, NewValue], mesh: Any) -> None:
@@ -65,11 +68,7 @@ class InternalVariables:
             with raised_on_all_ranks(self._comm), named(f"{name} cannot be compiled"):
                 expression = fem.Expression(value, interpolation_points(V))
             self._new.append((function, partial(_interpolated, expression, fem.Function(V))))
-
-    @property
-    def functions(self) -> list[fem.Function]:
-        """The functions, in the order in which they were given."""
-        return [function for function, _ in self._new]
+        self.functions = list(given)
 
     def in_cells(self) -> Array:
         """Return the present values, cell by cell, shape ``(cells, w)``."""

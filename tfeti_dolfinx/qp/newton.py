@@ -425,7 +425,7 @@ class FaceSolver:
         s = end.g - qp.coarse.combined(self.coarse.coordinates(end.g))
         self._enter(qp.feasible.face(on, s))
         lam = on + self.coarse.combined(self.coarse.solve(qp.coarse.residual(on)))
-        return None if imbalance(qp.coarse, lam) > HELD else qp.at(lam)
+        return None if imbalance(qp.coarse, lam) > HELD else Point(lam, qp.F(lam) - qp.d)
 
     def _has_left(self, z: Point) -> bool:
         """Return whether rows that do not slip are outside of Ω."""

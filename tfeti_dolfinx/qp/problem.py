@@ -74,10 +74,6 @@ class QP:
         """Return xᵀy of pairs of vectors, rank 0's on every rank. Collective."""
         return dot_over(self.coarse.comm, *pairs)
 
-    def at(self, lam: Array) -> Point:
-        """Return multipliers with their gradient: one multiplication by F. Collective."""
-        return Point(lam, self.F(lam) - self.d)
-
 
 class ConvergedReason(IntEnum):
     """Reasons of a solver to stop; positive: converged. Values as in KSPConvergedReason, if there.

@@ -280,6 +280,7 @@ class Ellipses:
     def __init__(self, semi_axes: Array) -> None:
         self.semi_axes = np.asarray(semi_axes, dtype=float)
         self._moves = self.semi_axes > 0.0
+        # so that ‖t/a‖ is 1 on the boundary; entries that are fixed do not count
         self._inverse = np.divide(
             1.0, self.semi_axes, out=np.zeros(self.semi_axes.shape), where=self._moves
         )
@@ -287,7 +288,7 @@ class Ellipses:
     def project(self, x: Array) -> Array:
         """Return the nearest points of the ellipses."""
         t = x.reshape(self.semi_axes.shape)
-        outside = self._level(t) > 1.0
+        outside = _lengths(t * self._inverse) > 1.0
         nearest = np.where(self._moves, t, 0.0)
         if np.any(outside):
             nearest[outside] = self._nearest(t[outside], outside)
@@ -345,18 +346,14 @@ class Ellipses:
         values = self.project(x).reshape(self.semi_axes.shape).copy()
         t = np.where(self._moves, x.reshape(self.semi_axes.shape), 0.0)
         slips = np.any(status.reshape(self.semi_axes.shape) == Status.SLIP, axis=1)
-        inward = slips & (self._level(t) < 1.0) & np.any(t != 0.0, axis=1)
+        inward = slips & (_lengths(t * self._inverse) < 1.0) & np.any(t != 0.0, axis=1)
         if np.any(inward):
             values[inward] = self._nearest(t[inward], inward)
         return np.asarray(values.ravel())
 
-    def _level(self, t: Array) -> Array:
-        """‖t/a‖, 1 on the boundary; entries that are fixed do not count."""
-        return _lengths(t * self._inverse)
-
     def _boundary(self, t: Array) -> tuple[Array, Array]:
         """Flags of what is on the boundary, and its outward normals; 0 where nothing moves."""
-        on = self._level(t) >= 1.0 - ON
+        on = _lengths(t * self._inverse) >= 1.0 - ON
         steep = t * self._inverse**2
         size = _lengths(steep)[:, None]
         normal = np.divide(steep, size, out=np.zeros_like(t), where=size > 0.0)

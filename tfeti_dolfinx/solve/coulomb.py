@@ -318,7 +318,7 @@ class FrictionBounds:
         subdomains, forces = self._dual.subdomains, np.zeros(self._constraints.num_rows)
         forces[self._rows] = self._mu * pressures
         squares = sums(self._constraints.forces(forces) ** 2, subdomains.trace_parts)
-        squares = subdomains.body_sums([squares])[0]
+        squares = subdomains.of_bodies([squares])[0]
         return steering(self._comm, *np.sqrt(squares))
 
 

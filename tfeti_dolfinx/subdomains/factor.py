@@ -69,6 +69,8 @@ class CholeskyFactor:
             _check_definite(self._factor)
             if not np.all(np.isfinite(self.solve(np.ones(self._b.getLocalSize())))):
                 raise NotPositiveDefiniteError("a pivot is zero")
+            # those of L, as far as its package tells
+            self.entries = float(max(self._factor.getInfo()["nz_used"], self._b.getLocalSize()))
         except (PETSc.Error, FactorError) as error:
             # PETSc knows no package yet where it could not read an option
             solver = pc.getFactorSolverType() or f"PETSc, with options -{prefix}...,"
@@ -77,11 +79,6 @@ class CholeskyFactor:
         finally:
             pc.destroy()
             matrix.destroy()
-
-    @property
-    def entries(self) -> float:
-        """Entries of L, as far as its package tells."""
-        return float(max(self._factor.getInfo()["nz_used"], self._b.getLocalSize()))
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -119,7 +118,7 @@ def gives_no_energy(K: Any, rigid: Array, x: Array, inverse: CholeskyFactor) -> 
     Pivots that should be 0 are positive where rounding makes them so. ``rigid`` are all rigid
     motions, as springs may hold some by little. It takes one solve.
     """
-    noise = _noise(K.shape[0])
+    noise = np.random.default_rng(0).standard_normal(K.shape[0])
     u = inverse.solve(noise - rigid @ (rigid.T @ noise))
     u -= rigid @ (rigid.T @ u)
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
@@ -132,8 +131,3 @@ def gives_no_energy(K: Any, rigid: Array, x: Array, inverse: CholeskyFactor) -> 
     length = np.linalg.norm(np.ptp(x, axis=0))
     fine = length > TOLERANCES.fine * edges.min(initial=np.inf)
     return not (fine or diagonal.max() > TOLERANCES.spread * diagonal.min())
-
-
-@lru_cache(64)
-def _noise(size: int) -> Array:
-    return np.random.default_rng(0).standard_normal(size)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 from weakref import WeakSet, WeakValueDictionary
@@ -245,16 +245,14 @@ class EqualityTolerances:
 EQUAL = EqualityTolerances()
 
 
+@dataclass(eq=False)
 class EqualSubdomains:
-    """The stiffnesses of a rank, each held once; ``kept`` are those that ``keep`` holds.
+    """The stiffnesses of a rank, each held once."""
 
-    ``how`` makes their inverses.
-    """
-
-    def __init__(self, how: InverseFactory) -> None:
-        self.how = how
-        self._of_shape: dict[bytes, WeakSet[Stiffness]] = defaultdict(WeakSet)
-        self.kept: dict[str, tuple[Stiffness, Traced | None]] = {}
+    how: InverseFactory  # makes their inverses
+    # those that `keep` holds, by names of subdomains
+    kept: dict[str, tuple[Stiffness, Traced | None]] = field(default_factory=dict)
+    _of_shape: dict[bytes, WeakSet[Stiffness]] = field(default_factory=lambda: defaultdict(WeakSet))
 
     def keep(self, blocks: Sequence[Block]) -> None:
         """Hold the stiffnesses of Blocks, with their factors, for those that come after them.

@@ -224,18 +224,14 @@ class Subdomains:
         pairs = zip(self.elastic, self.body_of_block, strict=False)
         return joined([block.turned_beyond(amounts[body]) for block, body in pairs])
 
-    def body_sums(self, values: Sequence[Sequence[float]]) -> Array:
-        """Sums over the Blocks of each body, shape ``(q, b)``, of q values each. Collective.
+    def of_bodies(self, values: Sequence[Sequence[float]] | Array, largest: bool = False) -> Array:
+        """Sums over the Blocks of each body of q values each, or the largest. Collective.
 
-        Values may be given of elastic Blocks alone: those of rigid bodies are 0 then.
+        Shape ``(q, b)``. Values may be given of elastic Blocks alone: those of rigid bodies are 0
+        then; no largest one is less.
         """
-        found = np.array(values, dtype=float).T
-        return np.ascontiguousarray(self._on_bodies(found, (len(values),)).T)
-
-    def body_maxima(self, values: Sequence[Sequence[float]] | Array) -> Array:
-        """Largest over the Blocks of each body, at least 0, as in ``body_sums``. Collective."""
-        found = np.array(values, dtype=float).T
-        return np.ascontiguousarray(self._on_bodies(found, (len(values),), np.maximum, MPI.MAX).T)
+        found = self._on_bodies(np.array(values, dtype=float).T, (len(values),), largest)
+        return np.ascontiguousarray(found.T)
 
     # ------------------------------------------------------------ displacements
 
@@ -275,18 +271,14 @@ class Subdomains:
         for at, (block, part) in enumerate(zip(self.blocks, self.dof_parts, strict=True)):
             nodes = u[:, part].reshape(len(u), -1, block.bs)
             found[at] = np.einsum("qni,qni->qn", nodes, nodes).max(axis=1, initial=0.0)
-        return self.body_maxima(np.sqrt(found).T)
+        return self.of_bodies(np.sqrt(found).T, largest=True)
 
     def _on_bodies(
-        self,
-        values: Sequence[Array] | Array,
-        shape: tuple[int, ...],
-        combine: np.ufunc = np.add,
-        op: MPI.Op = MPI.SUM,
+        self, values: Sequence[Array] | Array, shape: tuple[int, ...], largest: bool = False
     ) -> Array:
         """Values of the Blocks, each of this shape, combined by bodies from 0 on. Collective."""
-        total = np.zeros((self.num_bodies, *shape))
-        body = self.body_of_block[: len(values)]
+        total, body = np.zeros((self.num_bodies, *shape)), self.body_of_block[: len(values)]
+        combine, op = (np.maximum, MPI.MAX) if largest else (np.add, MPI.SUM)
         combine.at(total, body, np.reshape(values, (len(values), *shape)))
         self.comm.Allreduce(MPI.IN_PLACE, total, op=op)
         return total
@@ -317,6 +309,9 @@ class FiniteElements:
     """
 
     replaces = False  # whether something takes the place of finite elements
+    inside = 0  # unknowns of all ranks that the method does without
+    # makes the factory of this rank's Blocks from that of finite elements; None: it is that
+    blocks: Callable[[MakeBlock], MakeBlock] | None = None
 
     def __init__(self, dofs: TornDofs) -> None:
         self._dofs = dofs
@@ -332,17 +327,9 @@ class FiniteElements:
         """Return this rank's load in DOLFINx's numbering."""
         return forms.load()
 
-    def blocks(self, make_block: MakeBlock) -> MakeBlock:
-        """Return the factory of this rank's Blocks, those of finite elements as given."""
-        return make_block
-
     def solved(self, u: Array) -> Any:
         """Return what the method knows of the solution, in primal order, or None."""
         return None
-
-    def inside(self) -> int:
-        """Return the number of unknowns of all ranks that the method does without."""
-        return 0
 
 
 @runtime_checkable
