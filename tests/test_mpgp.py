@@ -1,21 +1,14 @@
-"""MPGP and SMALSE-M with discs, ellipses and intervals: optimal by an independent projection."""
-
-from dataclasses import replace
+"""MPGP with discs, ellipses and intervals: optimal by an independent projection."""
 
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mpi4py import MPI
 from reference.untorn import check_optimal
 from test_discs import discs
-from test_qp import matrix, to, vector
+from test_qp import matrix
 
-from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps, homogenise
+from tfeti_dolfinx.qp.problem import Steps
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Product, Status
-from tfeti_dolfinx.qp.smalse import smalse
 
 
 def program(seed, k, isotropic, m=40, r=4):
@@ -38,21 +31,6 @@ def program(seed, k, isotropic, m=40, r=4):
 def as_set(bounded, pairs, a, isotropic):
     sets = Ellipses(np.repeat(a[:, :1], a.shape[1], axis=1) if isotropic else a)
     return Product([(bounded, Bounds()), (pairs.ravel(), sets)])
-
-
-@settings(max_examples=12)
-@given(st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans())
-def test_smalse_on_random_programs(seed, k, isotropic):
-    F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
-    coarse, feasible = DenseCoarse(G, e), as_set(bounded, pairs, a, isotropic)
-    qp = QP(matrix(F), vector(d), coarse, feasible)
-    qp = replace(qp, norm=estimate_norm(qp.F, coarse, 60))
-    homogenised = homogenise(qp)
-    result = smalse(qp, homogenised, to(1e-10, homogenised), max_it=20_000)
-    assert result.reason == ConvergedReason.CONVERGED_RTOL
-    lam = result.lam
-    check_optimal(F, d, G, e, bounded, lam, pairs=pairs, axes=a)
-    assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
 
 
 def test_mpgp_slides_sticks_and_falls_off():

@@ -1,4 +1,4 @@
-"""Block Newton with discs, ellipses and intervals: optimal by an independent projection."""
+"""Block Newton and SMALSE-M with discs and intervals: optimal by an independent projection."""
 
 from dataclasses import replace
 
@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from reference.untorn import check_optimal
 from test_discs import discs
 from test_mpgp import around_circles, as_set, program
-from test_qp import Counted, matrix, vector
+from test_qp import Counted, matrix, to, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
+from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import (
     QP,
@@ -24,6 +25,7 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import Status
+from tfeti_dolfinx.qp.smalse import smalse
 
 
 def solved(qp, tolerance, monitor=no_monitor, start=None):
@@ -37,14 +39,18 @@ def solved(qp, tolerance, monitor=no_monitor, start=None):
 @settings(max_examples=12)
 @given(st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans())
 def test_random_programs(seed, k, isotropic):
+    """By block Newton and by SMALSE-M."""
     F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
     feasible = as_set(bounded, pairs, a, isotropic)
     qp = QP(matrix(F), vector(d), DenseCoarse(G, e), feasible)
-    result = solved(qp, 1e-10 * np.linalg.norm(d))
-    assert result.reason == ConvergedReason.CONVERGED_RTOL
-    lam = result.lam
-    check_optimal(F, d, G, e, bounded, lam, pairs=pairs, axes=a)
-    assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
+    qp = replace(qp, norm=estimate_norm(qp.F, qp.coarse, 60))
+    start = homogenise(qp)
+    slow = smalse(qp, start, to(1e-10, start), max_it=20_000)
+    for result in (solved(qp, 1e-10 * np.linalg.norm(d)), slow):
+        assert result.reason == ConvergedReason.CONVERGED_RTOL
+        lam = result.lam
+        check_optimal(F, d, G, e, bounded, lam, pairs=pairs, axes=a)
+        assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("isotropic", [True, False])
