@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from reference.untorn import check_optimal
 from test_newton_discs import solved
 from test_qp import bounds_on, matrix, vector
@@ -11,6 +12,7 @@ from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import first_point, newton
 from tfeti_dolfinx.qp.problem import QP, StoppingRule, homogenise, operator_product
 from tfeti_dolfinx.qp.projection import project_onto_feasible
+from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Bounds, Product
 
 
@@ -78,6 +80,18 @@ def test_what_nearly_dependent_rows_of_G_leave_is_no_residual():
     qp, F, P = nearly_dependent()
     result = solve_by_pcpg(qp, homogenise(qp), StoppingRule(1e-9), max_it=3000)
     assert np.linalg.norm(P @ (F @ result.lam - qp.d)) <= 2e-8
+
+
+def test_images_of_earlier_directions_that_are_off_by_1e_10_do_not_stall_conjugate_gradients():
+    """r is not orthogonal to W then, and p, conjugate to it, soon is to r."""
+    F, d, G, e, _ = program(2, "no kernel")
+    W = np.linalg.inv(np.linalg.cholesky(F)).T[:, :3]
+    images, known = F @ W * (1.0 + 1e-10 * np.sign(W)), Recycled(9, MPI.COMM_SELF)
+    known.take(np.stack((W, images), axis=1))
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), Product(), recycled=known)
+    result = solve_by_pcpg(qp, homogenise(qp), StoppingRule(1e-13), max_it=500)
+    assert result.reason > 0
+    assert np.allclose(F @ result.lam, qp.d, rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize(("room", "solvable"), [(-0.5, False), (0.5, True)])

@@ -187,7 +187,9 @@ def pcpg(
         if recycled is not None:
             new = [*new[1 - recycled.capacity :], (p, Fp, pFp)]
         own.r = left
-        own.fresh, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
+        drifts, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
+        # images of earlier solves are too inexact where r is not even orthogonal to a first p
+        past, own.fresh = None if drifts and own.fresh else past, drifts
         steps.cg += 1
         monitor(steps, "cg", point.lam, norm, 0.0)
     for direction in new:
