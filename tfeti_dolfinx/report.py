@@ -497,7 +497,7 @@ def _residuals(
 
 
 def _tolerances(solution: Solution, accuracy: Accuracy) -> dict[str, float]:
-    comm, allowed = solution.dofs.comm, accuracy.tolerances()
+    comm, allowed = solution.dofs.comm, accuracy.allowed
     return {
         "displacement_error": accuracy.rtol,
         "energy_error": accuracy.energy_error()[1],

@@ -62,6 +62,11 @@ class ContactSearch:
         ]
         self.contacts = [contact for contact, _ in settled]
         self._records = [self._from_origin(records) for _, records in settled]
+        # primal nodes of the surfaces of each contact
+        self._nodes = [
+            [np.unique(facet_nodes(dofs, decomposition.facets(name))) for name in contact.surfaces]
+            for contact in self.contacts
+        ]
         # beside the conditions that they were found with, some up to a larger reach
         self._wide: dict[int, tuple[ContactRecords, ContactRecords, float]] = {}
 
@@ -84,10 +89,8 @@ class ContactSearch:
         """
         dofs = self._dofs
         bends = dofs.V.element.basix_element.degree > 1
-        found = [contact for contact in self.contacts if bends or len(contact.surfaces) > 1]
-        names = [name for contact in found for name in contact.surfaces]
-        nodes = [facet_nodes(dofs, dofs.decomposition.facets(name)).ravel() for name in names]
-        groups = dofs.group[np.concatenate([np.empty(0, dtype=np.int64), *nodes])]
+        found = [nodes for both in self._nodes if bends or len(both) > 1 for nodes in both]
+        groups = dofs.group[np.concatenate([np.empty(0, dtype=np.int64), *found])]
         return any_rank(dofs.comm, dofs.lookup(groups, changed)[0])
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
@@ -129,7 +132,9 @@ class ContactSearch:
         way = u if self._origin is None else u - self._origin
         count = 0
         for i, contact in enumerate(self.contacts):
-            moved = self._approach(contact, way.reshape(-1, self._dofs.bs))
+            moved = 0.0
+            if len(contact.surfaces) > 1:
+                moved = self._approach(self._nodes[i], way.reshape(-1, self._dofs.bs))
             tried = [(self._records[i], self._reach[i])]
             if moved > self._reach[i]:
                 # conditions up to twice the way, kept for the next ways while those near stay
@@ -194,13 +199,9 @@ class ContactSearch:
             if self._dofs.comm.rank == 0:
                 log.warning("contact %s has nothing within reach=, and no constraints", contact)
 
-    def _approach(self, contact: ContactPartner, u: Array) -> float:
+    def _approach(self, nodes: Sequence[Array], u: Array) -> float:
         """Sum of both surfaces' largest displacements against their common mean, on all ranks."""
-        dofs, cut, comm = self._dofs, self._dofs.decomposition, self._dofs.comm
-        if len(contact.surfaces) == 1:
-            return 0.0
-        nodes = (np.unique(facet_nodes(dofs, cut.facets(name))) for name in contact.surfaces)
-        moved = [u[at] for at in nodes]
+        comm, moved = self._dofs.comm, [u[at] for at in nodes]
         own = np.sum([np.append(part.sum(axis=0), len(part)) for part in moved], axis=0)
         *total, count = summed(comm, own)
         squares = [np.sum((u - np.divide(total, count)) ** 2, axis=1) for u in moved]

@@ -201,12 +201,13 @@ class Accuracy(StoppingRule):
         recovered: What the last look has recovered.
         u: This rank's part of its displacement, shape ``(n,)``.
         looks: How many looks there were.
-        measures: What the last look has seen.
+        measures: What the last look has seen, and ``allowed`` the tolerances of that.
         goal: An error beside which the algebraic one has to be small, too, or None.
         reached: What looks have seen of that.
     """
 
     measures: Measures
+    allowed: Tolerances
     u: Array
 
     def __init__(
@@ -276,6 +277,7 @@ class Accuracy(StoppingRule):
         now = measure(self._dual, state, face, self.norm, before)
         self._before = self.measures if self.looks else None
         self.recovered, self.measures, self.u = state, now, state.u
+        self.allowed = self._tolerances()
         self.looks, self.waits = self.looks + 1, False
         if self.goal is not None:
             bound = energy_bound(self._dual, state.lam, state.u, self.norm)
@@ -318,8 +320,8 @@ class Accuracy(StoppingRule):
             estimate = np.maximum(estimate, now.change * (now.error / before.error))
         return np.maximum(estimate + now.correction, self._least)
 
-    def tolerances(self) -> Tolerances:
-        """Return the tolerances that the last assessment is compared with."""
+    def _tolerances(self) -> Tolerances:
+        """Return the tolerances that the measures are compared with."""
         now, given = self.measures, self._limits
         at_rest = self._at_rest()
         most = now.size.max(initial=0.0)
@@ -343,14 +345,14 @@ class Accuracy(StoppingRule):
 
     def ratio(self) -> float:
         """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
-        now, allowed = self.measures, self.tolerances()
+        now, allowed = self.measures, self.allowed
         errors = np.array([*self.errors(), now.penetration, now.balance, now.error])
         limits = np.array([*allowed.displacement, allowed.jump, allowed.balance, allowed.energy])
         return max(float(np.max(errors / np.maximum(limits, TINY))), self._over_goal())
 
     def relative_error(self) -> float:
         """Return the largest estimated error of a body over its largest displacement."""
-        noise = self.tolerances().displacement / max(self.rtol, self._limits.noise)
+        noise = self.allowed.displacement / max(self.rtol, self._limits.noise)
         return float(np.max(self.errors() / np.maximum(noise, TINY), initial=0.0))
 
     def energy_error(self) -> tuple[float, float]:
@@ -358,7 +360,7 @@ class Accuracy(StoppingRule):
 
         Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
         """
-        now, allowed = self.measures, self.tolerances().energy
+        now, allowed = self.measures, self.allowed.energy
         size = max(now.energy, allowed, TINY)
         return now.error / size, allowed / size
 
