@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import ufl
-from dolfinx import fem
+from dolfinx import fem, la
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
@@ -62,6 +62,7 @@ class Forms:
     """
 
     rounding: Array | None = None
+    _entries: la.MatrixCSR | None = None
     names: ClassVar[tuple[str, str]] = ("a", "L")
 
     def __init__(
@@ -92,6 +93,7 @@ class Forms:
         name = self.names[0]
         check_form(a, name, self._V, self._decomposition)
         self._a = self._compiled(a, name)
+        self._assembled, self._entries = False, None
         self._data = {**self._data, "stiffness": data_of(a, self._V)}
         self.given = {**self.given, name: a}
 
@@ -112,8 +114,13 @@ class Forms:
         return {name for name, data in asked.items() if data.has_changed()}
 
     def stiffness(self) -> Any:
-        """Return this rank's K in DOLFINx's numbering, scipy CSR."""
-        return assemble_csr(self._a)
+        """Return this rank's K in DOLFINx's numbering, scipy CSR; the third on the second's data.
+
+        Entries are kept where a form is assembled again: of one that is not, factors are enough.
+        """
+        A = self._entries or fem.create_matrix(self._a, la.BlockMode.expanded)
+        self._assembled, self._entries = True, A if self._assembled else None
+        return assemble_csr(self._a, A)
 
     def load(self) -> Array:
         """Return this rank's f in DOLFINx's numbering."""

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import basix
 import numpy as np
 import ufl
-from dolfinx import fem, la
+from dolfinx import fem
 from mpi4py import MPI
 from scipy.sparse import csr_array
 from ufl.algorithms import expand_derivatives
@@ -17,7 +17,7 @@ from ufl.constantvalue import Zero
 from ufl.corealg.traversal import unique_pre_traversal
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import assemble_csr, geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.newmark import Inertia
@@ -107,7 +107,6 @@ class NewtonForms(Forms):
         self._x = u.function_space.mesh.geometry.x
         self._reference = self._x.copy() if finite else None
         self._matrix: csr_array | None = None
-        self._entries: la.MatrixCSR | None = None
         mesh, tdim = u.function_space.mesh, u.function_space.mesh.topology.dim
         cells = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
         # strains are differences to the identity, and displacements of nodes to those beside them
@@ -122,11 +121,9 @@ class NewtonForms(Forms):
         return found | {"load"} if "stiffness" in found else found
 
     def stiffness(self) -> Any:
-        """Return this rank's J(u), on the data of the last one."""
-        if self._entries is None:
-            self._entries = fem.create_matrix(self._a, la.BlockMode.expanded)
+        """Return this rank's J(u)."""
         with self._in_place():
-            self._matrix = assemble_csr(self._a, self._entries)
+            self._matrix = super().stiffness()
         return self._matrix
 
     def load(self) -> Array:
