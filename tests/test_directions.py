@@ -7,7 +7,7 @@ import pytest
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps, StoppingRule
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.recycling import DirectionStore
 from tfeti_dolfinx.qp.sets import Product
 
@@ -30,7 +30,7 @@ def program(spread):
 
 
 def solved(qp, directions, target, most=1000):
-    steps, point = Steps(), qp.at(np.zeros(n))
+    steps, point = Steps(), Point(np.zeros(n), -qp.d)
     target *= np.linalg.norm(point.g)
     reason = pcpg(qp, point, StoppingRule(target), steps, most, directions=directions)
     return reason, steps.cg, point.lam

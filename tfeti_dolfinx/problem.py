@@ -548,7 +548,6 @@ class ContactProblem:
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
         self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
-        self._go_on_from(state)
 
     # ------------------------------------- what bodies with mass and nonlinear ones add
 
@@ -569,9 +568,6 @@ class ContactProblem:
 
     def _take_motion(self, state: SavedState) -> None:
         """Move as the bodies of a state do: without inertia not at all."""
-
-    def _go_on_from(self, state: SavedState) -> None:
-        """Take from a state what is known of its rows besides λ: without inertia nothing."""
 
     # ------------------------------------------------------------------- checks
 

@@ -62,7 +62,7 @@ AT_NODES = {
     rf"{FLOOR}: bound is nan at the point \[.*; expected a number, 0 or more": on_floor(
         lambda s: tfeti.Tresca(lambda x: np.nan * x[0])
     ),
-    rf"{FLOOR}: bound, a function, did not give one number for each of \d points": on_floor(
+    rf"{FLOOR}: bound at points of shape \(3, \d+\) has the shape \(3, \d+\); expected": on_floor(
         lambda s: tfeti.Tresca(lambda x: x)
     ),
     rf"{FLOOR}: direction \(0, 0, 1\) is along the normal at the node \[": on_floor(

@@ -17,8 +17,8 @@ from tfeti_dolfinx.common.validation import (
     Range,
     checked_number,
     checked_vector,
-    real_numbers,
     shown,
+    values_at,
 )
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -208,13 +208,7 @@ def numbers_at(what: str, value: Any, x: Array, lowest: float = -np.inf) -> Arra
     an InputError where the function fails, or a number is not finite or below the lowest.
     """
     if callable(value):
-        try:
-            value = np.broadcast_to(real_numbers(value(x.T)), (len(x),))
-        except Exception as error:  # a user's function may raise anything
-            raise InputError(
-                f"{what}, a function, did not give one number for each of {len(x)} points of "
-                f"shape (3, {len(x)}): {type(error).__name__}: {error}"
-            ) from error
+        value = values_at(value, x.T, (len(x),), f"{what} at")
     values = np.array(np.broadcast_to(value, (len(x),)), dtype=float)
     if np.any(wrong := ~(np.isfinite(values) & (values >= lowest))):
         expected = FINITE if lowest < 0.0 else NOT_NEGATIVE

@@ -158,9 +158,10 @@ def conditions(
     whole = dofs.reduce_on_owners(side.facets.vertices.ravel(), side.areas.ravel())
     chosen = np.flatnonzero(area > SEARCH.hardly_covered * whole)
     vertices, areas = integrals.vertices, area[chosen]
-    gap, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen)
-    curved_gap, spread = _mean_gaps(dofs, vertices, integrals.curved_gap, areas, chosen)
-    changed = np.abs(_without_rounding(dofs, curved_gap - gap))
+    # what rounding of coordinates may make of a gap
+    rounding = SEARCH.no_gap * largest(dofs.comm, dofs.V.mesh.geometry.x)
+    gap, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen, rounding)
+    curved_gap, spread = _mean_gaps(dofs, vertices, integrals.curved_gap, areas, chosen, rounding)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, integrals.entries)
@@ -176,7 +177,7 @@ def conditions(
         gap=gap,
         geometric_gap=gap,
         curved_gap=curved_gap,
-        conforms=changed > spread,
+        conforms=np.abs(curved_gap - gap) > np.maximum(spread, rounding),
         area=areas,
         covered=areas / whole[chosen],
         within_reach=np.ones(len(chosen), dtype=bool),
@@ -194,20 +195,18 @@ def conditions(
 
 
 def _mean_gaps(
-    dofs: TornDofs, vertices: Array, gap: GapIntegrals, area: Array, chosen: Array
+    dofs: TornDofs, vertices: Array, gap: GapIntegrals, area: Array, chosen: Array, rounding: float
 ) -> tuple[Array, Array]:
-    """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width."""
+    """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
+
+    Means up to ``rounding`` are 0. Collective.
+    """
     groups = vertices.ravel()
     total = dofs.reduce_on_owners(groups, gap.total.ravel())[chosen]
     low = dofs.reduce_on_owners(groups, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduce_on_owners(groups, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
-    return _without_rounding(dofs, np.clip(total / area, low, high)), high - low
-
-
-def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
-    """0 in the place of gaps that rounding of coordinates may have made of it. Collective."""
-    allowed = SEARCH.no_gap * largest(dofs.comm, dofs.V.mesh.geometry.x)
-    return np.where(np.abs(gap) <= allowed, 0.0, gap)
+    mean = np.clip(total / area, low, high)
+    return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:

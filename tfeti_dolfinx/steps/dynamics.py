@@ -349,10 +349,18 @@ class ContactDynamics(ContactProblem):
         predicted, image = self._predictor.start
         return replace(state, predicted=predicted, predicted_image=image)
 
-    def _go_on_from(self, state: SavedState) -> None:
-        self.solution.v = self.dofs.to_dolfinx(state.velocity)
-        known = any_rank(self.decomposition.comm, state.predicted.size > 0)
-        if self._predictor is not None and known:
+    def restore(self, state: SavedState) -> None:
+        """Go on where another run of the same program has been.
+
+        Raises:
+            InputError: As ``ContactProblem.restore``, or the state has no velocities.
+        """
+        super().restore(state)
+        self.solution.v = self._forms_in_time.inertia.motion.v
+        if self._predictor is None:
+            return
+        state = state.on_nodes(self.dofs).on_rows(self._system.gluing)
+        if any_rank(self.decomposition.comm, state.predicted.size > 0):
             self._predictor.rows_and_start = self._system.gluing, state.predicted
             self._predictor.image = state.predicted_image
 

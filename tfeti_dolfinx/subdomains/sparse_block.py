@@ -314,8 +314,8 @@ class SparseBlock(Block):
     of the stiffness is that of the first of them. Creation raises an InputError where K is not
     symmetric, not finite or not positive semidefinite, or the load is not finite; a FactorError
     where a factor could not be made. ``equals`` finds the stiffness among those of equal
-    subdomains; without it, it shares none. ``place`` is the unknown of the stiffness for each of
-    its own, shape ``(n,)``.
+    subdomains; without it, it shares none. ``stiffness`` is K with its factors, until they are
+    let go, ``place`` the unknown of it for each of its own, shape ``(n,)``.
     """
 
     def __init__(
@@ -329,8 +329,8 @@ class SparseBlock(Block):
 
     def set_stiffness(self, K: Any) -> None:
         """Take a stiffness."""
-        stiffness, self.place = self._found(K)
-        self._stiffness: Stiffness | None = stiffness
+        self.stiffness, self.place = self._found(K)
+        stiffness = self.stiffness
         # the first of equal ones has the arrays of the stiffness themselves
         here = slice(None) if stiffness.x is self.x else self.place
         self.diagonal, self.kernel = stiffness.diagonal[here], stiffness.kernel[here]
@@ -344,13 +344,6 @@ class SparseBlock(Block):
         if self.equals is not None:
             return self.equals.find(self.name, self.x, K)
         return Stiffness(self.name, self.x, K, self._how), np.arange(K.shape[0])
-
-    @property
-    def stiffness(self) -> Stiffness:
-        """K and its factors."""
-        if self._stiffness is None:
-            raise FactorError(f"{self.name}: its factor has been destroyed")
-        return self._stiffness
 
     def multiply(self, u: Array) -> Array:
         """K u on all unknowns, shapes ``(n,)``."""
@@ -377,8 +370,8 @@ class SparseBlock(Block):
 
     def destroy(self) -> None:
         """Let the factors go, which nobody else may need."""
-        self._stiffness = None
-        self.__dict__.pop("traced", None)
+        for own in ("stiffness", "traced"):
+            self.__dict__.pop(own, None)
 
     @cached_property
     def traced(self) -> Traced:
