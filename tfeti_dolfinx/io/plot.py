@@ -293,7 +293,7 @@ def plot_friction(
                 size = np.quantile(length[length > 0.0], 0.8)
                 arrows = arrows / np.maximum(length / (2.0 * size), 1.0)[:, None]
                 scale = 14.0 * size / np.linalg.norm(np.ptp(x, axis=0))
-                look = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.003}
+                look = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.002}
                 plot.quiver(*x.T, *arrows.T, **look)
                 plot.update_datalim(x + arrows / scale)
             for value, (name, colour) in STATUS.items():
