@@ -55,14 +55,13 @@ def energy_bound(
 
 
 def admissible(
-    dual: Dual, lam: Array, u: Array, norm: float, passes: int = 4, far: float = 1e8
+    dual: Dual, lam: Array, u: Array, norm: float, far: float = 1e8
 ) -> tuple[Array, float]:
     """δ = v − u on the trace, which makes v admissible, and what contact loses by v. Collective.
 
     1. Equality rows are closed, and those of contact where λ + (Bu − c)/‖F‖ is in Ω: where a force
        is large beside what its row misses. The least δ in D does so.
-    2. Others may open, or slip. Where they overlap then, they are closed, too; after ``passes``
-       rounds all are.
+    2. Others may open, or slip. Where some overlap then, all are closed.
     3. Contact loses max μᵀq − λᵀq, μ ∈ Ω, by q = Bv − c; the maximum is at P_Ω(λ + tq), t ``far``
        beside the forces.
 
@@ -73,20 +72,19 @@ def admissible(
     contact = constraints.sets.contact
     g = constraints.jumps(u[dual.subdomains.trace]) - constraints.c
     p = lam + g / (norm or 1.0)
-    closed = (dual.feasible.project(p) == p)[contact]
+    held = (dual.feasible.project(p) == p)[contact]
     wanted = -g
-    for last in (*[False] * passes, True):
-        wanted[contact] = np.where(closed | last, -g[contact], 0.0)
-        change = min_norm_correction(constraints, wanted, closed | last)
+    for closed in (held, np.ones_like(held)):
+        wanted[contact] = np.where(closed, -g[contact], 0.0)
+        change = min_norm_correction(constraints, wanted, closed)
         left = constraints.jumps(change) - wanted  # of rows that are not closed: B δ
-        q = np.where(closed | last, 0.0, (g + left)[contact])
+        q = np.where(closed, 0.0, (g + left)[contact])
         t = far * largest(comm, lam) / (largest(comm, q) or 1.0)
         moved_by = within(dual.feasible, lam, contact, t * q)
         overlaps = (np.abs(moved_by) > 0.5 * t * np.abs(q)) & (q != 0.0)
         if not any_rank(comm, bool(overlaps.any())):
             break
-        closed |= overlaps
-    still = np.where(closed | last, np.abs(left[contact]), 0.0)
+    still = np.where(closed, np.abs(left[contact]), 0.0)
     return change, float(moved_by @ q + np.abs(lam[contact]) @ still)
 
 
