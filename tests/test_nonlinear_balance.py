@@ -1,6 +1,7 @@
 """Laws of mechanics that nonlinear bodies in contact keep: objectivity, balance, energy, h²."""
 
 import numpy as np
+import pytest
 import ufl
 from bodies import boxes, stacked
 from dolfinx import fem
@@ -70,11 +71,13 @@ def moving(decomposition, *fixed):
     return way, lambda V: [("upper top", None, way), *((s, None, np.zeros(2)) for s in fixed)]
 
 
-def test_forces_balance_and_friction_only_dissipates(comm):
-    """A narrow block pressed into a wide one and drawn to and fro, by Coulomb's law."""
-    decomposition = stacked("triangle", 4, 3, 3, upper=(0.2, 0.8))
+@pytest.mark.parametrize("scene", [(4, 3, 0.8, 0.1, "auto"), (8, 5, 0.7, 0.6, PAIR[1])])
+def test_forces_balance_and_friction_only_dissipates(scene, comm):
+    """A narrow block pressed into a wide one and drawn to and fro: it slips, or sticks."""
+    *n, end, mu, secondary = scene
+    decomposition = stacked("triangle", *n, 3, upper=(0.2, end))
     way, conditions = moving(decomposition, "lower bottom")
-    contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.1))
+    contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(mu), secondary=secondary)
     problem, _ = hyperelastic(decomposition, conditions, contact, rtol=1e-8)
     lost = 0.0
     for way.value[:] in ((0.0, -0.1), (0.2, -0.12), (-0.1, -0.1), (-0.1, 0.1)):
@@ -82,8 +85,7 @@ def test_forces_balance_and_friction_only_dissipates(comm):
         solution = problem.solution
         held = [solution.reaction(side) for side in ("lower bottom", "upper top")]
         below, above = (reaction.force for reaction in held)
-        push = solution.contact(0)
-        # of the secondary side; the other one has its reaction
+        push = solution.contact(0)  # of the secondary side; the other one has its reaction
         support = below if push.surface == "lower top" else above
         size = np.linalg.norm(support) if way.value[1] < 0.0 else 1e-5
         assert np.allclose(below, -above, rtol=0, atol=1e-9 * size)
@@ -91,7 +93,7 @@ def test_forces_balance_and_friction_only_dissipates(comm):
         assert abs(held[0].moment[2] + held[1].moment[2]) < 1e-4 * size
         assert solution.dissipation.min(initial=0.0) >= -1e-12 * E
         lost += comm.allreduce(float(np.sum(solution.dissipation)))
-    assert lost > 1e-3
+    assert lost > (1e-3 if mu < 0.5 else 0.0)
     assert np.linalg.norm(support) < 1e-12
 
 

@@ -220,13 +220,16 @@ class ContactSearch:
         """Conditions with the gaps of the total displacement."""
         if self._tools:  # at their places
             found = replace(found, motion=self._tools.motion_there(found))
+        gap = found.gap
         if self._origin is not None:
             way = relative_displacement(found, self._dofs, self._origin)
+            # a bound from above does not follow u: Newton's method would close that gap a step
+            gap = np.maximum(gap, found.mean_gap)
         elif self._tools:
             way = -found.motion
         else:
             return found
-        return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))
+        return replace(found, gap=gap + np.sum(found.normal * way, axis=1))
 
     def _count(self, flags: Array) -> int:
         return int(summed(self._dofs.comm, np.array([np.sum(flags)]))[0])
