@@ -289,30 +289,29 @@ class ContactProblem:
                     dual, options, options.qp_type, start, own.monitor, goal, own.stopping
                 )
         result, accuracy, settling = solved
+        state, lam = accuracy.recovered, result.lam.copy()
+        self._let_go = np.zeros(0, dtype=bool)
+        if state is not None and state.loose.count > dual.coarse.free_motions.count:
+            self._let_go = state.loose.moving
+            if result.reason > 0:  # forces of contact there are the solver's error
+                rows = np.append(dual.coarse.bounded, dual.coarse.rubbing)
+                lam[rows[~state.active[rows]]] = 0.0
         # 2. their displacement
         with stage("recovery", seconds):
-            multipliers = Multipliers(result.lam.copy(), result.face)
+            multipliers = Multipliers(lam, result.face)
             nodal = dual.subdomains.num_nodal
             system.tools.take(accuracy.u[nodal:])
             solution = self._make_solution(accuracy.u[:nodal], multipliers, gluing)
             self._solution = solution
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
-        end = gluing, solution.lam, result.mu, system.inverses
+        end = gluing, lam, result.mu, system.inverses
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
         counts = SolverCounts.of_run(dual, *solved)
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
         contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
         excluding = system.search.named(contacts)
-        state, loose = accuracy.recovered, list[dict[str, Any]]()
-        self._let_go = np.zeros(0, dtype=bool)
-        if state is not None and state.loose.count > dual.coarse.free_motions.count:
-            self._let_go = state.loose.moving
-            if self._start is not None:  # forces that are the solver's error are no start
-                rows = np.append(dual.coarse.bounded, dual.coarse.rubbing)
-                lam = np.array(solution.lam)
-                lam[rows[~state.active[rows]]] = 0.0
-                self._start = (gluing, lam, *end[2:])
+        loose = list[dict[str, Any]]()
         if options.warnings and state is not None:
             loose = dual.nearly_free(state.loose)
         looks = of_looks(accuracy.reached)
