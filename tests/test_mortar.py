@@ -227,7 +227,7 @@ def test_obstacle_under_a_uniform_pressure(cell, degree):
             "contact of .* with .*: secondary='lower bottom', expected one of its surfaces",
         ),
         (("upper bottom", "lower top"), {"gap": "none"}, "of 'upper bottom' .*: gap='none', exp"),
-        (("upper bottom", "lower top"), {"gap": lambda x: x[:1]}, "gap, a function, did not give"),
+        (("upper bottom", "lower top"), {"gap": lambda x: x[:1]}, r"gap at .* \(1, \d\); exp"),
         (("upper bottom", "lower top"), {"gap": lambda x: x[0] * np.nan}, "gap is .* at the point"),
     ],
 )
