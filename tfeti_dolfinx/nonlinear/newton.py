@@ -82,7 +82,7 @@ class NewtonTolerances:
     settled: float = 0.05
     frozen: float = 0.1
     turning: float = 0.03
-    anderson: int = 5
+    anderson: int = 3
     dependent: float = 1e-12
     slow: float = 0.7
     difference: float = 1e-6
