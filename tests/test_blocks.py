@@ -24,8 +24,6 @@ from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.testing import check_block
 
 RIGID = {"triangle": 3, "quadrilateral": 3, "tetrahedron": 6, "hexahedron": 6}
-
-
 ENERGIES = {
     "elastic": lambda u, v: ufl.inner(hooke()(u), strain(v)) * ufl.dx,
     "scalar": lambda u, v: ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx,

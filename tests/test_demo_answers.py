@@ -11,8 +11,6 @@ BOUND = 0.008  # of the friction of four bodies
 PAIRS = ("wedge left", "wedge right", "left bottom", "right bottom")
 BOLTS = 4 * 30e3  # of both clamps
 BARS = [f"{side} bar {i}" for i in (1, 2) for side in ("lower", "upper")]
-
-
 PEAK = ("half_width", "peak_pressure")
 SLIP = {"half_width": 0.05, "stick_half_width": 0.05}
 LOOP = {"stick_half_width": 0.05, "stick_after_turns": 0.05, "dissipation": 0.05}

@@ -18,8 +18,6 @@ LAWS = (
     lambda rng: tfeti.Tresca(10.0 ** rng.uniform(-4, -2)),
     lambda rng: tfeti.Coulomb(rng.uniform(0.05, 0.8)),
 )
-
-
 SOLVERS = (
     ({"qp_type": "newton"}, {"qp_type": "newton", "pc_type": "lumped"}),
     ({"qp_type": "smalse"}, {"qp_type": "smalse"}),

@@ -89,6 +89,15 @@ def test_where_the_mesh_makes_no_error_it_ends():
     assert is_reached(p)
     assert found["discretisation"] <= 1e-5 * found["energy"]
 
+    def lifted(V):
+        return [clamp(V, d.facets("top"), 0.02)]
+
+    for rtol in (1e-8, "auto"):  # ‖u‖_K is rounding
+        p = two_body_problem(d, pressed(d, 0.0, "top"), lifted, [], stress=stress, rtol=rtol)
+        p.solve()
+        assert 0.0 < p.estimate().algebraic <= p.report.estimates["rounding"] < 1e-11
+        assert not p.report.warnings
+
 
 def test_it_needs_a_stress():
     d = decomposed("triangle", 2, 2)

@@ -5,8 +5,6 @@ import pytest
 from demos import run
 
 TALK = ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none", "-tfeti_rtol", "1e-4"]
-
-
 SIZES = [(2, 99, 60), pytest.param(32, 99, 90, marks=pytest.mark.slow)]
 
 

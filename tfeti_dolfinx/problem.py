@@ -145,6 +145,7 @@ class ContactProblem:
                 "discretisation error from; expected ContactProblem(..., stress=sigma)"
             )
         self._counts, self._outcome = SolverCounts(), Outcome()
+        self._rounding = 0.0  # of ‖u‖_K, in the last solution
         self._in_all: dict[str, float] = {}
         self._logged: set[str] = set()  # warnings
         self._solution: Solution | None = None
@@ -314,7 +315,7 @@ class ContactProblem:
         loose = list[dict[str, Any]]()
         if options.warnings and state is not None:
             loose = dual.nearly_free(state.loose)
-        looks = of_looks(accuracy.reached)
+        looks, self._rounding = of_looks(accuracy), accuracy.allowed.rounding
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, looks, loose)
         warnings = list[str]()
         if options.warnings:
@@ -372,7 +373,7 @@ class ContactProblem:
             FactorError: A matrix could not be factored.
         """
         self._meet("estimate")
-        found = estimate(self._system, self.solution)
+        found = estimate(self._system, self.solution, self._rounding)
         known = {name: value for name, value in vars(found).items() if value is not None}
         self.report.take(with_estimates(self.report, known))
         self._log_warnings()

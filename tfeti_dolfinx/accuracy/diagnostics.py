@@ -284,8 +284,9 @@ def with_estimates(report: Report, numbers: dict[str, float]) -> Report:
 
 def _of_estimates(outcome: Outcome) -> Iterator[str]:
     """A bound of the algebraic error that no displacement of this size can miss."""
-    energy, bound = (outcome.estimates.get(key, 0.0) for key in ("energy", "algebraic"))
-    if bound > energy:
+    keys = ("energy", "algebraic", "rounding")
+    energy, bound, rounding = (outcome.estimates.get(key, 0.0) for key in keys)
+    if bound > max(energy, rounding):
         share = f"{bound / energy:.0e} times" if energy and np.isfinite(bound) else "far beyond"
         yield (
             f"{ESTIMATES}: the bound of the algebraic error is {share} the energy norm of the "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan
 from time import perf_counter
@@ -15,7 +14,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import steering, summed
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.duality_gap import energy_bound
-from tfeti_dolfinx.feti.stopping import ErrorTarget, TargetStatus
+from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
 from tfeti_dolfinx.forms.fields import Stress, StressRecovery, checked_stress
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.solution import Solution
@@ -33,6 +32,7 @@ class Estimates:
         discretisation: Estimate of ‖u* − ū‖_K, ū the exact solution of the continuous problem;
             None if the problem was given no stress. ``Solution.discretisation_error`` has its
             parts.
+        rounding: What rounding leaves of ‖u‖_K where bodies move and do not deform.
         factorizations: Subdomain matrices factored for it.
         lifting_multiplications: Applications of S, the Schur complements.
         recoveries: Displacements recovered, each for one more solve in every subdomain.
@@ -42,6 +42,7 @@ class Estimates:
     energy: float
     algebraic: float
     discretisation: float | None
+    rounding: float
     factorizations: int
     lifting_multiplications: int
     recoveries: int
@@ -60,8 +61,8 @@ class Estimates:
         )
 
 
-def estimate(system: System, solution: Solution) -> Estimates:
-    """Estimate the errors of the last solution. Collective."""
+def estimate(system: System, solution: Solution, rounding: float) -> Estimates:
+    """Estimate the errors of the last solution, ‖u‖_K of which may be rounding. Collective."""
     if solution.gluing.constraints is not system.gluing.constraints:
         raise InputError(
             "estimate: the constraints are not those of the solution; expected a call after solve()"
@@ -79,6 +80,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
         energy=float(energy),
         algebraic=bound.error,
         discretisation=float(discretisation) if solution.has_stress else None,
+        rounding=rounding,
         factorizations=comm.allreduce(how.factorizations - factored),
         lifting_multiplications=1,
         recoveries=int(bound.moved > 0.0),
@@ -99,8 +101,9 @@ def goal_of(stress: Stress, dofs: TornDofs, thickness: Any) -> ErrorTarget:
     return error
 
 
-def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
+def of_looks(accuracy: Accuracy) -> dict[str, float]:
     """Return the errors at the last assessment of a target, and the cost of all of them."""
+    reached = accuracy.reached
     if not reached:
         return {}
     last = reached[-1]
@@ -108,6 +111,7 @@ def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
         "energy": last.energy,
         "algebraic": last.bound.error,
         "discretisation": last.goal,
+        "rounding": accuracy.allowed.rounding,
         "lifting_multiplications": len(reached),
         "recoveries": sum(look.bound.moved > 0.0 for look in reached),
     }

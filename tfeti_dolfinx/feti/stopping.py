@@ -183,6 +183,7 @@ class Tolerances:
     jump: float
     balance: float  # force left on a kernel mode
     energy: float  # norm of the correction in energy, over all bodies
+    rounding: float  # its part that rounding leaves of bodies that do not deform
 
 
 class Accuracy(StoppingRule):
@@ -283,6 +284,7 @@ class Accuracy(StoppingRule):
             bound = energy_bound(self._dual, state.lam, state.u, self.norm)
             goal = self.goal(state.u)
             allowed = self._limits.target * max(goal, 1e-5 * now.energy)
+            allowed = max(allowed, self.allowed.rounding)
             self.reached.append(TargetStatus(bound, goal, now.energy, allowed))
 
     def look_again(self, face: Face) -> bool:
@@ -341,6 +343,7 @@ class Accuracy(StoppingRule):
             jump=2.0 * largest,
             balance=balance + all_rest * now.stiffness.max(initial=0.0),
             energy=given.energy * self.rtol * now.energy + rigid,
+            rounding=rigid,
         )
 
     def ratio(self) -> float:
