@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import sum_rows
+from tfeti_dolfinx.common.arrays import quotient, sum_rows
 from tfeti_dolfinx.common.files import written_whole
 from tfeti_dolfinx.common.parallel import largest, summed
 from tfeti_dolfinx.common.validation import named
@@ -25,7 +25,6 @@ from tfeti_dolfinx.contact.partner import position_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy
-from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
@@ -170,17 +169,15 @@ class ContactSummary:
         flags = [np.ones(len(of)), status != ContactStatus.OPEN, *kinds]
         own = np.column_stack((*flags, solution.condition_forces))
         sums = summed(comm, sum_rows(of, own, count))
-        hardly = (solution.gluing.records.covered < SEARCH.believed).astype(int)
-        extremes = np.full((3, count), -np.inf)
-        np.maximum.at(extremes, (hardly, of), solution.contact_pressure)
-        np.maximum.at(extremes[2], of, -solution.remaining_gap)
-        comm.Allreduce(MPI.IN_PLACE, extremes, op=MPI.MAX)
         counts, forces = sums[:, :4].T.astype(int).tolist(), sums[:, 4:].tolist()
-        pressure, others, ends = np.where(np.isfinite(extremes), extremes, 0.0)
-        pressure = np.where(pressure > 0.0, pressure, np.maximum(others, 0.0)).tolist()
-        gaps = (0.0 - ends).tolist()
+        least = np.full(count, np.inf)
+        np.minimum.at(least, of, solution.remaining_gap)
+        comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
+        gaps = np.where(np.isfinite(least), 0.0 + least, 0.0)  # of no node; never −0
+        pressure, others = solution.largest_pressures
+        pressure = np.where(pressure > 0.0, pressure, others)
         names = zip(*((c.name, c.surfaces[0]) for c in solution.contacts), strict=True)
-        columns: list[Any] = [*names, *counts, forces, pressure, gaps]
+        columns: list[Any] = [*names, *counts, forces, pressure.tolist(), gaps.tolist()]
         return [cls(*row) for row in zip(*columns, strict=True)]
 
     def __str__(self) -> str:
@@ -234,16 +231,12 @@ class Outcome:
         nearly_free: list[dict[str, Any]],
     ) -> Self:
         """Measure an answer, warnings apart. Collective."""
-        status, normals = solution.status_of_conditions, solution.gluing.constraints.sets.normals
-        own = (
-            np.sum(solution.carrying[normals]),
-            np.sum(status == ContactStatus.STICK),
-            np.sum(status == ContactStatus.SLIP),
-            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-        )
-        active, sticking, sliding, kilobytes = map(int, summed(dual.coarse.comm, np.array(own)))
+        active = np.sum(solution.carrying[solution.gluing.constraints.sets.normals])
+        own = np.array([active, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss])
+        active, kilobytes = map(int, summed(dual.coarse.comm, own))
+        contacts = ContactSummary.of_solution(solution)
         return cls(
-            contacts=ContactSummary.of_solution(solution),
+            contacts=contacts,
             clusters=dual.subdomains.num_clusters,
             kernel_dim=dual.coarse.dimension,
             soft_modes=(dual.deflation.count if dual.deflation else dual.subdomains.num_springs),
@@ -251,8 +244,8 @@ class Outcome:
             nearly_free=nearly_free,
             excluding_contacts=excluding,
             active_contacts=active,
-            sticking=sticking,
-            sliding=sliding,
+            sticking=sum(contact.sticking for contact in contacts),
+            sliding=sum(contact.sliding for contact in contacts),
             recycled_directions=0 if dual.recycled is None else dual.recycled.count,
             local_operators=_local_operators(dual),
             converged_reason=result.reason.name,
@@ -474,8 +467,7 @@ def _residuals(
     # of a set of one's own, as of glue that lets go, a force may pull, across a gap too
     missing = dual.feasible.project(solution.lam) - solution.lam
     missing = rows.scale * missing[solution.gluing.constraints.sets.normals]
-    area = solution.area[rows.condition]
-    tension = np.divide(missing, area, out=np.zeros(len(area)), where=area > 0.0)
+    tension = quotient(missing, solution.area[rows.condition])
     closed = solution.status_of_conditions != ContactStatus.OPEN
     # how far copies of a node are apart, and from prescribed values
     dofs, prescribed = solution.dofs, solution.gluing.prescribed

@@ -12,7 +12,7 @@ from dolfinx import fem, geometry
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.constraints.contact_state import (
@@ -45,6 +45,7 @@ from tfeti_dolfinx.forms.fields import (
     von_mises,
 )
 from tfeti_dolfinx.mortar.facets import facet_nodes, group_points, hat_integrals, surface_facets
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Displacement and stress at given points --------------------------------------------------
 
@@ -332,8 +333,7 @@ class Solution:
         area = sum_rows(records.group, self.area, dofs.num_groups)
         surfaces = [contact.surfaces[0] for contact in self.contacts]
         whole = hat_integrals(dofs, surfaces, self.thickness)
-        area = np.minimum(area, whole)[:, None]
-        return np.divide(total, area, out=np.zeros_like(total), where=area > 0.0)
+        return quotient(total, np.minimum(area, whole)[:, None])
 
     # ---------------------------------------- contacts, conditions, rigid bodies
 
@@ -370,7 +370,7 @@ class Solution:
             area=self.area[own],
             gap=self.remaining_gap[own],
             status=self.status_of_conditions[own],
-            tangential_traction=np.divide(friction, area, out=0.0 * friction, where=area > 0.0),
+            tangential_traction=quotient(friction, area),
             slip=self.slip_of_conditions[own],
             surface=self.contacts[position].surfaces[0],
             resultant=resultant(self.dofs.comm, places, self.condition_forces[own]),
@@ -442,7 +442,7 @@ class Solution:
         force[rows.condition] = rows.scale * self.lam[self.gluing.constraints.sets.normals]
         if not any_rank(self.dofs.comm, len(records.held) > 0):
             return force
-        pressure = np.divide(force, self.area, out=0.0 * force, where=self.area > 0.0)
+        pressure = quotient(force, self.area)
         beside = np.zeros(len(records.held))
         for contact in range(len(self.contacts)):
             own, of = records.contact == contact, records.contact[records.held] == contact
@@ -466,7 +466,20 @@ class Solution:
     @cached_property
     def contact_pressure(self) -> Array:
         """Force over area of each contact condition of this rank. Collective at first use."""
-        return np.divide(self.force, self.area, out=0.0 * self.force, where=self.area > 0.0)
+        return quotient(self.force, self.area)
+
+    @cached_property
+    def largest_pressures(self) -> Array:
+        """Largest pressures of each contact, shape ``(2, contacts)``. Collective at first use.
+
+        Those of nodes of which the other side covers 2 % or more, and those of others, which are
+        not believed; 0 where there are none.
+        """
+        records, found = self.gluing.records, np.zeros((2, len(self.contacts)))
+        hardly = (records.covered < SEARCH.believed).astype(int)
+        np.maximum.at(found, (hardly, records.contact), self.contact_pressure)
+        self.dofs.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+        return found
 
     @cached_property
     def area(self) -> Array:

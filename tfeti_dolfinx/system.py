@@ -135,8 +135,8 @@ class Settings:
         Raise an InputError where the solver cannot keep the rows, or takes no preconditioner of
         one's own; else as ``Dual``.
         """
-        rows, gdim = constraints.sets.contact_rows(dofs.comm), dofs.V.mesh.geometry.dim
-        options = resolved(self.options, rows, self.prefix)
+        gdim = dofs.V.mesh.geometry.dim
+        options = resolved(self.options, constraints.contact_rows, self.prefix)
         preconditioner = self.extensions.preconditioner
         if preconditioner is not None and options.pc_type == "none":
             raise InputError(

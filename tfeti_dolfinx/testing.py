@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.errors import require
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 from tfeti_dolfinx.subdomains.block import (
@@ -255,7 +255,7 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     atol = tol * np.abs(K).max() * np.abs(w).max(initial=0.0)
     require(np.allclose(block.apply_stiffness(w), K_bb @ w, atol=atol), "apply_stiffness is K_bb")
     # K⁺ and S
-    tol = max(tol, TOLERANCES.lost * np.finfo(float).eps * values[-1] / values[r])
+    tol = max(tol, TOLERANCES.lost * EPSILON * values[-1] / values[r])
     _check_inverse(block, floating, w, v, tol)
     K_bi, K_ii = K[np.ix_(trace, inner)], K[np.ix_(inner, inner)]
     Sw = K_bb @ w - K_bi @ (np.linalg.lstsq(K_ii, K_bi.T, rcond=TOLERANCES.rank)[0] @ w)

@@ -12,7 +12,7 @@ import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import TINY, Array, joined, sum_rows, sums
+from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest
 from tfeti_dolfinx.contact.partner import GEOMETRY
@@ -79,8 +79,6 @@ def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
 
 # --- Warnings ---------------------------------------------------------------------------------
 
-# relative rounding of a stiffness
-EPSILON = float(np.finfo(float).eps)
 ESTIMATES = "estimates"  # how the sentence on them begins
 
 
@@ -244,10 +242,12 @@ class Diagnostics:
         change = np.where(solution.force > 0.0, np.abs(change), overlap)
         believed = records.covered >= SEARCH.believed
         pressure = np.where(believed, solution.force, 0.0) / records.area
+        peaks = np.zeros(len(solution.contacts))
+        np.maximum.at(peaks, records.contact, pressure)
+        comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
         for i, contact in enumerate(solution.contacts):
-            own = records.contact == i
-            largest = comm.allreduce(float(pressure[own].max(initial=0.0)), op=MPI.MAX)
-            own &= shown & (change > np.maximum(LIMITS.facets * largest * gives, 0.0))
+            own = shown & (records.contact == i)
+            own &= change > np.maximum(LIMITS.facets * peaks[i] * gives, 0.0)
             columns = change, gives, records.curved_gap
             most = np.array([column[own].max(initial=-np.inf) for column in columns])
             comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
@@ -255,7 +255,7 @@ class Diagnostics:
                 yield (
                     f"{contact.name}: facets are straight where the surfaces are curved, and "
                     f"change the gap, at most {most[2]:.2g} there, by up to {most[0]:.2g}, where "
-                    f"the largest pressure presses elements together by {largest * most[1]:.2g}; "
+                    f"the largest pressure presses elements together by {peaks[i] * most[1]:.2g}; "
                     'expected gap="curved", a mesh of degree 2, or smaller facets'
                 )
 
@@ -326,18 +326,12 @@ def notes_of(outcome: Outcome, solution: Solution) -> list[str]:
 
 def _hardly_covered(solution: Solution) -> Iterator[str]:
     """Pairs with large pressures on slivers, whose ∫φ_i are small against forces. Collective."""
-    records, count = solution.gluing.records, len(solution.contacts)
-    if all(len(contact.surfaces) == 1 for contact in solution.contacts):
-        return
-    hardly = (records.covered < SEARCH.believed).astype(int)
-    most = np.zeros((2, count))
-    np.maximum.at(most, (hardly, records.contact), solution.contact_pressure)
-    solution.dofs.comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
-    for i in np.flatnonzero(most[1] > LIMITS.stands_out * most[0]):
+    most, others = solution.largest_pressures
+    for i in np.flatnonzero(others > LIMITS.stands_out * most):
         yield (
-            f"{solution.contacts[i].name}: pressures go up to {most[1, i]:.3g} at nodes of which "
+            f"{solution.contacts[i].name}: pressures go up to {others[i]:.3g} at nodes of which "
             f"the other side covers less than {SEARCH.believed:.0%}, elsewhere they are at most "
-            f"{most[0, i]:.3g}; forces are right, pressures of such nodes are not: "
+            f"{most[i]:.3g}; forces are right, pressures of such nodes are not: "
             "expected the other side as the secondary one, or a node where the other side ends"
         )
 

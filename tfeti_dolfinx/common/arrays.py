@@ -19,6 +19,12 @@ Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
+EPSILON = float(np.finfo(float).eps)  # relative rounding of a number
+
+
+def quotient(a: Array, b: Array) -> Array:
+    """a/b entry by entry, 0 where b is not positive."""
+    return np.divide(a, b, out=np.zeros(np.broadcast(a, b).shape), where=b > 0.0)
 
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import Exchange, any_rank, chunk_offsets, owner_of
+from tfeti_dolfinx.common.parallel import Exchange, any_rank, chunk_offsets, owner_of, summed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -79,11 +80,6 @@ class RowSets:
     def contact(self) -> Array:
         """All rows of contact conditions, normals first."""
         return np.concatenate((self.normals, self.tangents.ravel()))
-
-    def contact_rows(self, comm: MPI.Intracomm) -> tuple[int, int]:
-        """Return the number of normal and of tangential rows on all ranks. Collective."""
-        normals, tangents = comm.allreduce(np.array([self.normals.size, self.tangents.size]))
-        return int(normals), int(tangents)
 
 
 # --- Scaling D of rows ------------------------------------------------------------------------
@@ -170,6 +166,13 @@ class Constraints:
         c = np.append(self.c[:rows], np.zeros(count))
         sets = replace(sets, springs=rows + np.arange(count), springs_of=subdomain)
         return replace(self, B=B, c=c, sets=sets)
+
+    @cached_property
+    def contact_rows(self) -> tuple[int, int]:
+        """The numbers of normal and of tangential rows on all ranks. Collective at first use."""
+        own = np.array([self.sets.normals.size, self.sets.tangents.size])
+        normals, tangents = summed(self.B.getComm().tompi4py(), own)
+        return int(normals), int(tangents)
 
     @property
     def pressed(self) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import largest, summed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import Facets, hat_integrals
@@ -285,8 +285,7 @@ def vertex_tractions(
     area = hat_integrals(dofs, names, thickness)
     if dofs.V.element.basix_element.degree > 1:
         forces = _on_hats(forces, dofs)
-    on_surface = (area > 0.0)[:, None]
-    return np.divide(forces, area[:, None], out=np.zeros_like(forces), where=on_surface), area
+    return quotient(forces, area[:, None]), area
 
 
 def _on_hats(forces: Array, dofs: TornDofs) -> Array:

@@ -176,7 +176,7 @@ class Dual:
         self.deflation: Deflation | None = None
         if self.preconditioner is not None and deflation is not None:
             self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
-        self.contact_rows = constraints.sets.contact_rows(comm)
+        self.contact_rows = constraints.contact_rows
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms = dict[int, float]()  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()

@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points, whole_facets
@@ -75,8 +75,7 @@ def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Arr
     t = np.einsum("nvwg,nvkg->nvwk", d, axes)
     flat = np.linalg.norm(t, axis=3)
     u = t / np.where(flat > 0.0, flat, np.inf)[..., None]
-    other = length > 0.0
-    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=other)
+    inverse = quotient(np.ones(length.shape), length)
     # ½ uᵀKu = Σ_k m_k(u) K_k, K_k the entries of K on and above the diagonal
     pairs = combinations_with_replacement(range(u.shape[-1]), 2)
     terms = [(0.5 if i == j else 1.0) * u[..., i] * u[..., j] for i, j in pairs]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
+from tfeti_dolfinx.common.arrays import EPSILON
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class SearchTolerances:
     edge: float = 0.94
     at_edge: float = 1e-3  # of a facet's radius: a vertex so near an edge of a shape lies on it
     # of a cosine: facets that turn by less are parts of a plane
-    turned: float = 8.0 * float(np.finfo(float).eps)
+    turned: float = 8.0 * EPSILON
     # curvatures that are known by less of a neighbour's weight are taken to be 0
     unknown: float = 0.05
     # steps of Newton's method to reference coordinates; facets that are not folded take 3 or 4

@@ -8,7 +8,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.nonlinear.hyperelasticity import displacement_gradient
@@ -227,7 +227,7 @@ class _Return:
         diagonal -= along[:, None, None] * self.n[:, :, None] * self.n[:, None, :]
         # (ε_a − ε_b)/(b_a − b_b) = ln(1 + x)/2x b_b, x = b_a/b_b − 1, which rounding leaves alone
         x = self.b[:, :, None] / self.b[:, None, :] - 1.0
-        small = np.abs(x) < np.finfo(float).eps
+        small = np.abs(x) < EPSILON
         ratio = np.where(small, 1.0, np.log1p(x) / np.where(small, 1.0, x))
         return diagonal, elastic[:, None, None] * ratio / (2.0 * self.b[:, None, :])
 

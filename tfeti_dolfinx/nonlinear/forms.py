@@ -16,7 +16,7 @@ from ufl.algorithms import expand_derivatives
 from ufl.constantvalue import Zero
 from ufl.corealg.traversal import unique_pre_traversal
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.forms.assembly import Forms
@@ -26,7 +26,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 # degree of the quadrature whose points det F is looked at
 DEGREE = 4
 # of |J| |u|: a load less than this is its rounding, and that of F
-ROUNDING = 32.0 * float(np.finfo(float).eps)
+ROUNDING = 32.0 * EPSILON
 
 
 def dead_loads(F: ufl.Form, u: fem.Function) -> ufl.Form:

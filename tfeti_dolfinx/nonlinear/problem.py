@@ -11,7 +11,7 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.common.agreement import agreeing
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, largest, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
 from tfeti_dolfinx.constraints.contact_state import Multipliers
@@ -146,7 +146,7 @@ class NonlinearContactProblem(ContactProblem):
         length = bcast_from_root(decomposition.comm, diameter(decomposition))
         self._least = self._tolerances.nowhere * length if finite else 0.0
         # of where bodies are
-        self._last_digit = float(np.finfo(float).eps) * length if finite else 0.0
+        self._last_digit = EPSILON * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
         self._last_increment = self._loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.parallel import dot_over, norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.qp.coarse import HELD
@@ -41,7 +41,6 @@ class FrictionParameters:
 
 
 DEFAULT = FrictionParameters()
-EPSILON = float(np.finfo(float).eps)
 
 # --- The law ----------------------------------------------------------------------------------
 

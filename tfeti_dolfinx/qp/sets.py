@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array, Entries, beside, transposed
+from tfeti_dolfinx.common.arrays import TINY, Array, Entries, beside, quotient, transposed
 from tfeti_dolfinx.errors import InputError
 
 # --- Faces ------------------------------------------------------------------------------------
@@ -281,9 +281,7 @@ class Ellipses:
         self.semi_axes = np.asarray(semi_axes, dtype=float)
         self._moves = self.semi_axes > 0.0
         # so that ‖t/a‖ is 1 on the boundary; entries that are fixed do not count
-        self._inverse = np.divide(
-            1.0, self.semi_axes, out=np.zeros(self.semi_axes.shape), where=self._moves
-        )
+        self._inverse = quotient(np.ones(self.semi_axes.shape), self.semi_axes)
 
     def project(self, x: Array) -> Array:
         """Return the nearest points of the ellipses."""
@@ -337,7 +335,7 @@ class Ellipses:
         pushing = np.maximum(-np.sum(g * normal, axis=1), 0.0)
         slope = np.linalg.norm(self._inverse**2 * t, axis=1)
         bent = np.sum(self._inverse**2 * normal[:, ::-1] ** 2, axis=1)
-        kappa = pushing * np.divide(bent, slope, out=0.0 * slope, where=slope > 0.0)
+        kappa = pushing * quotient(bent, slope)
         rows, tangents = 2 * along[:, None] + (0, 1), np.stack((-n[:, 1], n[:, 0]), axis=1)
         return Face(free, status.ravel(), rows, tangents, kappa[along])
 
@@ -355,9 +353,7 @@ class Ellipses:
         """Flags of what is on the boundary, and its outward normals; 0 where nothing moves."""
         on = _lengths(t * self._inverse) >= 1.0 - ON
         steep = t * self._inverse**2
-        size = _lengths(steep)[:, None]
-        normal = np.divide(steep, size, out=np.zeros_like(t), where=size > 0.0)
-        return on | ~self._moves.any(axis=1), normal
+        return on | ~self._moves.any(axis=1), quotient(steep, _lengths(steep)[:, None])
 
     def _nearest(self, z: Array, which: Array) -> Array:
         """Return the nearest points of the boundary: a_j²z_j/(a_j² + μ)."""
@@ -368,7 +364,7 @@ class Ellipses:
         a, z = a / scale, z / scale
         y = a * a * z / np.maximum(a * a + _secular(a, z)[:, None], TINY)
         # the last rounding of μ must not leave y off the boundary
-        level = np.linalg.norm(np.divide(y, a, out=np.zeros_like(y), where=a > 0.0), axis=1)
+        level = np.linalg.norm(quotient(y, a), axis=1)
         return np.asarray(scale * y / np.maximum(level, TINY)[:, None])
 
 
@@ -385,13 +381,13 @@ def _secular(a: Array, z: Array) -> Array:
     """
     c = a * np.abs(z)
     mu = np.max(c - a * a, axis=1, initial=-np.inf)  # one term alone is 1 there
-    outside = np.sum(np.divide(c, a * a, out=np.zeros_like(c), where=a > 0.0) ** 2, axis=1) >= 1.0
+    outside = np.sum(quotient(c, a * a) ** 2, axis=1) >= 1.0
     mu = np.where(outside, np.maximum(mu, 0.0), mu)
     for _ in range(MOST_STEPS):
         below = a * a + mu[:, None]
-        terms = np.divide(c, below, out=np.zeros_like(c), where=below > 0.0) ** 2
+        terms = quotient(c, below) ** 2
         total = terms.sum(axis=1)
-        slope = np.divide(terms, below, out=np.zeros_like(c), where=below > 0.0).sum(axis=1)
+        slope = quotient(terms, below).sum(axis=1)
         wanted = total > 1.0
         step = np.divide(total * (np.sqrt(total) - 1.0), slope, out=np.zeros_like(mu), where=wanted)
         mu = mu + step

@@ -18,6 +18,7 @@ from tfeti_dolfinx.common.arrays import (
     node_means,
     parts_of,
 )
+from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -83,7 +84,7 @@ class Subdomains:
         springs = [block.springs for block in self.blocks]
         of_springs = [0 if own is None else len(own.stiffness) for own in springs]
         self.spring_parts = parts_of(of_springs)
-        self.num_springs = int(comm.allreduce(sum(of_springs)))
+        self.num_springs = int(summed(comm, np.array([sum(of_springs)]))[0])
         self.dof_parts = parts_of([len(block.load) for block in self.blocks])
         self.kernel_parts = parts_of([block.kernel.shape[1] for block in self.blocks])
         self.elastic_parts = list(zip(self.elastic, self.dof_parts, strict=False))
