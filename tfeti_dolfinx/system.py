@@ -12,7 +12,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import stage
-from tfeti_dolfinx.common.parallel import any_rank, summed
+from tfeti_dolfinx.common.parallel import any_rank, count_over
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
@@ -370,7 +370,7 @@ class System:
         has_kernel = self._dual is None or self.dual.coarse.dimension > 0
         before, self._counted = self._counted, self.how.factorizations
         return StageCounts(
-            factorizations=int(summed(self._dofs.comm, np.array([self._counted - before]))[0]),
+            factorizations=count_over(self._dofs.comm, self._counted - before),
             coarse_factorizations=done["coarse problem"] if has_kernel else 0,
             assemblies=done["stiffness"],
             searches=done["search"],

@@ -11,7 +11,7 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import steering, summed
+from tfeti_dolfinx.common.parallel import count_over, steering, summed
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.duality_gap import energy_bound
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
@@ -81,7 +81,7 @@ def estimate(system: System, solution: Solution, rounding: float) -> Estimates:
         algebraic=bound.error,
         discretisation=float(discretisation) if solution.has_stress else None,
         rounding=rounding,
-        factorizations=comm.allreduce(how.factorizations - factored),
+        factorizations=count_over(comm, how.factorizations - factored),
         lifting_multiplications=1,
         recoveries=int(bound.moved > 0.0),
         seconds=perf_counter() - start,

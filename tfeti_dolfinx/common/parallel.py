@@ -51,6 +51,11 @@ def summed(comm: MPI.Intracomm, values: Array) -> Array:
     return values
 
 
+def count_over(comm: MPI.Intracomm, flags: Array | int) -> int:
+    """Return how many flags are set on all ranks, or the sum of their counts. Collective."""
+    return int(summed(comm, np.array([np.sum(flags)]))[0])
+
+
 def dot_over(comm: MPI.Intracomm, *pairs: tuple[Array, Array]) -> list[float]:
     """xᵀy of pairs of vectors that are spread over ranks, rank 0's on each. Collective."""
     products = np.array([x @ y for x, y in pairs])

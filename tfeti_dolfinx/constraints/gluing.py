@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import space_of
-from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.parallel import any_rank, count_over
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.constraints.contact_rows import (
     ContactRows,
@@ -259,7 +259,7 @@ class Gluing:
         held, left, rounding = self._held()
         decided, comm = left[normals.decided], self.dofs.comm
         wrong = decided < -rounding[normals.decided]
-        overlaps = comm.allreduce(int(np.sum(wrong)))
+        overlaps = count_over(comm, wrong)
         deepest = comm.allreduce(float(decided.min(initial=0.0)), op=MPI.MIN)
         if overlaps:
             raise NoSolutionError(

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
 from tfeti_dolfinx.common.logging import cite
-from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over
 from tfeti_dolfinx.common.validation import checked_type, is_whole, shown
 from tfeti_dolfinx.contact.friction import FrictionLaw, numbers_at, with_friction
 from tfeti_dolfinx.contact.records import ContactRecords, Side, conditions, relative_motion
@@ -268,7 +268,7 @@ class Obstacle(ContactPartner):
             check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
             _, towards = self._distances(centres, dofs.bs)
-        facing = dofs.comm.allreduce(int(np.sum(np.sum(towards * facets.normal, axis=1) > 0.0)))
+        facing = count_over(dofs.comm, np.sum(towards * facets.normal, axis=1) > 0.0)
         if dofs.bs > 1 and facing == 0:
             raise InputError(
                 f"{self.name}: the surface faces away from it; expected "
@@ -411,7 +411,7 @@ class Contact(ContactPartner):
             found = settled._meet(sides, dofs, contact, reach, reach)
         facets = sides[0].facets
         cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
-        edges = dofs.comm.allreduce(int(np.sum(cosine < SEARCH.crease)))
+        edges = count_over(dofs.comm, cosine < SEARCH.crease)
         worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
         if worse and dofs.comm.rank == 0:
             log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
@@ -452,8 +452,7 @@ class Contact(ContactPartner):
         for surface in self.surfaces:
             facets = local_facets(dofs, surface_facets(dofs.decomposition, surface), kind)
             whole = facets.radius ** (dofs.bs - 1)
-            flat = int(np.sum(facets.area <= SEARCH.degenerate * whole))
-            if count := dofs.comm.allreduce(flat):
+            if count := count_over(dofs.comm, facets.area <= SEARCH.degenerate * whole):
                 raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")
             facets, normals = with_averaged_normals(facets, dofs)
             facets = with_curvature(facets, dofs, kind)
@@ -473,8 +472,8 @@ class Contact(ContactPartner):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
             integrals = integrate(kind, secondary, primary, segments)
-        averted = comm.allreduce(int(segments.averted))
-        if averted and comm.allreduce(len(segments.weight)) == 0:
+        averted = any_rank(comm, segments.averted)
+        if averted and count_over(comm, len(segments.weight)) == 0:
             raise InputError(
                 f"{self.name}: the surfaces are near but face away from each other; expected "
                 "outward normals that oppose each other"
@@ -509,7 +508,7 @@ def _ratios(
     blocks = whole.reshape(-1, dofs.bs, dofs.bs)
     named = records.entry_group[records.within_reach[records.condition]]
     meets = dofs.reduce_on_owners(named, np.ones(len(named))) > 0.0
-    if dofs.comm.allreduce(int(np.sum(meets))) == 0:
+    if not any_rank(dofs.comm, meets):
         meets[:] = True
     sums = []
     for side in sides:

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, summed
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
@@ -130,7 +130,7 @@ class ContactSearch:
         rows are new, on all ranks.
         """
         way = u if self._origin is None else u - self._origin
-        count = 0
+        comm, count = self._dofs.comm, 0
         for i, contact in enumerate(self.contacts):
             moved = 0.0
             if len(contact.surfaces) > 1:
@@ -142,11 +142,11 @@ class ContactSearch:
                 if known is not self._records[i] or reach < moved:
                     wide = self._search(i, 2.0 * moved)
                     self._wide[i] = self._records[i], wide, 2.0 * moved
-                if self._count(self._overlapping(wide, u, tolerance) & ~wide.within_reach):
+                if count_over(comm, self._overlapping(wide, u, tolerance) & ~wide.within_reach):
                     tried.insert(0, (self._search(i, moved), moved))
             for found, reach in tried:
                 overlaps = self._overlapping(found, u, tolerance)
-                if new := self._count(overlaps & ~found.within_reach):
+                if new := count_over(comm, overlaps & ~found.within_reach):
                     self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
                     self._reach[i] = reach
                     count += new
@@ -165,12 +165,13 @@ class ContactSearch:
 
         Return how many rows are new, on all ranks; 0 where nothing is left to find.
         """
+        comm = self._dofs.comm
         while True:
             new, left = 0, False
             for i, contact in enumerate(self.contacts):
-                found, before = self._records[i], self._count(self._records[i].within_reach)
+                found, before = self._records[i], count_over(comm, self._records[i].within_reach)
                 searched = len(contact.surfaces) == 1 or self._reach[i] >= self.length
-                if searched and self._count(~found.within_reach) == 0:
+                if searched and count_over(comm, ~found.within_reach) == 0:
                     continue  # all nodes have their rows
                 reach = max(SEARCH.wider * self._reach[i], SEARCH.least * self.length)
                 if not searched:
@@ -178,7 +179,7 @@ class ContactSearch:
                 distance = found.gap if self._origin is None else found.geometric_gap
                 within = found.within_reach | (distance <= reach)
                 self._reach[i], self._records[i] = reach, replace(found, within_reach=within)
-                new, left = new + self._count(within) - before, True
+                new, left = new + count_over(comm, within) - before, True
             if new or not left:
                 return new
 
@@ -230,6 +231,3 @@ class ContactSearch:
         else:
             return found
         return replace(found, gap=gap + np.sum(found.normal * way, axis=1))
-
-    def _count(self, flags: Array) -> int:
-        return int(summed(self._dofs.comm, np.array([np.sum(flags)]))[0])

@@ -15,6 +15,7 @@ from ufl.algorithms import estimate_total_polynomial_degree
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.compat import geometry_degree
+from tfeti_dolfinx.common.parallel import count_over
 from tfeti_dolfinx.common.validation import POSITIVE, Range, checked_number, checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.checks import check_mesh, check_not_negative
@@ -250,7 +251,7 @@ def _by_volume(
         cells = on.cell_tags.find(tag)
         function.x.array[cell_dof[cells]] = value
         given[cells] = True
-    if missing := on.comm.allreduce(int(np.sum(~given))):
+    if missing := count_over(on.comm, ~given):
         others = {name: tag for name, tag in on.names.volumes.items() if tag not in by_tag}
         raise InputError(
             f"{what}: {missing} cells have no value; expected one for every volume, without one "

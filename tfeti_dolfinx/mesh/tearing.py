@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import create_mesh_in_place
-from tfeti_dolfinx.common.parallel import Exchange, bcast_from_root, offset_of, summed
+from tfeti_dolfinx.common.parallel import Exchange, bcast_from_root, count_over, offset_of, summed
 from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.bisection import bisect_points
@@ -94,7 +94,7 @@ def decomposed(
     None stands for subdomains of about 4000 displacement unknowns. ``spread`` shares out the cells
     among ranks at first, where one rank has read them.
     """
-    total = comm.allreduce(len(untorn.cells))
+    total = count_over(comm, len(untorn.cells))
     if subdomains is None:
         per_cell = {"triangle": 0.5, "tetrahedron": 0.2}.get(untorn.cell_type.name, 1.0)
         gdim = untorn.x.shape[1]

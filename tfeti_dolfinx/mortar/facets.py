@@ -15,7 +15,7 @@ from dolfinx import mesh as dmesh
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import JIT_OPTIONS, geometry_dofmap
-from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks
+from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks, count_over
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -303,10 +303,10 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
     """Local facets of a contact surface, which is a part of the boundary, ascending. Collective."""
     facets = decomposition.facets(name)
     comm = decomposition.comm
-    if comm.allreduce(len(facets)) == 0:
+    if count_over(comm, len(facets)) == 0:
         raise InputError(f"surface {name!r} has no facets; expected a part of the boundary")
     inside = np.setdiff1d(facets, decomposition.boundary, assume_unique=True)
-    if count := comm.allreduce(len(inside)):
+    if count := count_over(comm, len(inside)):
         raise InputError(
             f"surface {name!r}: {count} of its facets lie inside a body; "
             "expected facets on the boundary only"

@@ -348,8 +348,7 @@ class NonlinearContactProblem(ContactProblem):
         subdomains = self._system.subdomains
         primal = subdomains.with_rigid(self.dofs.to_primal(d))
         diagonal = sum(
-            float(block.diagonal @ primal[part] ** 2)
-            for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True)
+            float(block.diagonal @ primal[part] ** 2) for block, part in subdomains.block_parts
         )
         own = [sum(subdomains.energies(primal)), diagonal, at_u @ d]
         energy, diagonal, slope = map(float, self._total(np.array(own)))

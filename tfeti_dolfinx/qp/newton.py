@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import any_rank, largest, least, norm_over, steering, summed
+from tfeti_dolfinx.common.parallel import any_rank, count_over, largest, least, norm_over, steering
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
@@ -115,7 +115,7 @@ def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1, roughly: float 
 
     def carrying() -> int:
         touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
-        return max(int(summed(qp.coarse.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
+        return max(count_over(qp.coarse.comm, touching & (lam != 0.0)), 1)
 
     count, turn = carrying(), ProjectionParameters(balanced=roughly)
     for _ in range(max_it):

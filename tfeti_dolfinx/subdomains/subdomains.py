@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.arrays import (
     node_means,
     parts_of,
 )
-from tfeti_dolfinx.common.parallel import summed
+from tfeti_dolfinx.common.parallel import count_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -84,9 +84,10 @@ class Subdomains:
         springs = [block.springs for block in self.blocks]
         of_springs = [0 if own is None else len(own.stiffness) for own in springs]
         self.spring_parts = parts_of(of_springs)
-        self.num_springs = int(summed(comm, np.array([sum(of_springs)]))[0])
+        self.num_springs = count_over(comm, sum(of_springs))
         self.dof_parts = parts_of([len(block.load) for block in self.blocks])
         self.kernel_parts = parts_of([block.kernel.shape[1] for block in self.blocks])
+        self.block_parts = list(zip(self.blocks, self.dof_parts, strict=True))
         self.elastic_parts = list(zip(self.elastic, self.dof_parts, strict=False))
         self.size = sum(len(block.load) for block in self.blocks)
         self.load_rounding: Array = np.zeros(self.size)
@@ -105,7 +106,7 @@ class Subdomains:
         """Let other rows act, on these trace unknowns, ascending."""
         if np.array_equal(trace, self.trace):
             return
-        for block, part in zip(self.blocks, self.dof_parts, strict=True):
+        for block, part in self.block_parts:
             own = slice(*np.searchsorted(trace, (part.start, part.stop)))
             block.retrace(trace[own] - part.start)
         self._read_trace()
@@ -114,7 +115,7 @@ class Subdomains:
         """Replace the load, shape ``(n,)``; raise an InputError if it does not fit. Collective."""
         self._pinv_load = None
         with raised_on_all_ranks(self.comm):
-            for block, part in zip(self.blocks, self.dof_parts, strict=True):
+            for block, part in self.block_parts:
                 block.update(f=f[part])
 
     def local_operator(self, kind: OperatorKind, once: bool = False) -> LocalOperator:
@@ -153,8 +154,7 @@ class Subdomains:
 
     def spring_motions(self, u: Array) -> Array:
         """√D Pᵀu of the springs, shape ``(k,)``, for u of shape ``(n,)``."""
-        pairs = zip(self.blocks, self.dof_parts, strict=True)
-        found = [(own, u[part]) for block, part in pairs if (own := block.springs) is not None]
+        found = [(own, u[part]) for b, part in self.block_parts if (own := b.springs) is not None]
         return joined([np.sqrt(own.stiffness) * (own.stretches.T @ v) for own, v in found])
 
     @property
@@ -211,8 +211,7 @@ class Subdomains:
 
     def moments(self, u: Array) -> Array:
         """Cᵀ W u of each body, shape ``(b, k)``, u on all unknowns. Collective."""
-        pairs = zip(self.blocks, self.dof_parts, strict=True)
-        found = [block.modes.T @ (block.shares * u[part]) for block, part in pairs]
+        found = [block.modes.T @ (block.shares * u[part]) for block, part in self.block_parts]
         return self._on_bodies(found, (self.num_modes,))
 
     def modes_motion(self, amounts: Array) -> Array:
@@ -239,7 +238,7 @@ class Subdomains:
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shape ``(n,)``."""
         x = np.zeros(len(b))
-        for block, part in zip(self.blocks, self.dof_parts, strict=True):
+        for block, part in self.block_parts:
             if b[part].any():  # most bear no load of their own
                 x[part] = block.solve(b[part])
         return x
@@ -254,8 +253,7 @@ class Subdomains:
 
     def energies(self, u: Array) -> list[float]:
         """uᵀKu of each Block."""
-        pairs = zip(self.blocks, self.dof_parts, strict=True)
-        return [float(u[part] @ block.multiply(u[part])) for block, part in pairs]
+        return [float(u[part] @ block.multiply(u[part])) for block, part in self.block_parts]
 
     def extended(self, v: Array) -> Array:
         """Return a trace vector, shape ``(t,)``, on all unknowns, 0 elsewhere, shape ``(n,)``."""
@@ -269,7 +267,7 @@ class Subdomains:
         Of q displacements, each of shape ``(n,)``.
         """
         u, found = np.array(displacements), np.zeros((len(self.blocks), len(displacements)))
-        for at, (block, part) in enumerate(zip(self.blocks, self.dof_parts, strict=True)):
+        for at, (block, part) in enumerate(self.block_parts):
             nodes = u[:, part].reshape(len(u), -1, block.bs)
             found[at] = np.einsum("qni,qni->qn", nodes, nodes).max(axis=1, initial=0.0)
         return self.of_bodies(np.sqrt(found).T, largest=True)
