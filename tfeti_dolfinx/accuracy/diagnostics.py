@@ -139,8 +139,7 @@ class Diagnostics:
 
     def _cells(self) -> Iterator[str]:
         """Cells that are far from regular."""
-        flat = float(np.max(flatness(self._decomposition.mesh), initial=1.0))
-        worst = float(self._dofs.comm.allreduce(flat, op=MPI.MAX))
+        worst = largest(self._dofs.comm, flatness(self._decomposition.mesh))
         if worst > LIMITS.flat:
             yield (
                 f"cells: the flattest is about {2.0 * worst:.0e} times as long as thick; forces "

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import space_of
-from tfeti_dolfinx.common.parallel import any_rank, count_over
+from tfeti_dolfinx.common.parallel import any_rank, count_over, least
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.constraints.contact_rows import (
     ContactRows,
@@ -260,7 +259,7 @@ class Gluing:
         decided, comm = left[normals.decided], self.dofs.comm
         wrong = decided < -rounding[normals.decided]
         overlaps = count_over(comm, wrong)
-        deepest = comm.allreduce(float(decided.min(initial=0.0)), op=MPI.MIN)
+        deepest = least(comm, float(decided.min(initial=0.0)))
         if overlaps:
             raise NoSolutionError(
                 "an obstacle or a contact lies within a part of the surface whose displacement is "

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import Exchange, any_rank, chunk_offsets, owner_of, summed
+from tfeti_dolfinx.common.parallel import Exchange, any_rank, chunk_offsets, least, owner_of, summed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -98,7 +98,7 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
     means = np.mean(np.maximum(diagonals, 0.0), axis=1)
     positive = means > 0.0  # what is not is reported when Blocks are built
     lowest = float(np.min(means[positive], initial=np.inf))
-    D = np.where(positive, means / comm.allreduce(lowest, op=MPI.MIN), 1.0)
+    D = np.where(positive, means / least(comm, lowest), 1.0)
     return np.repeat(D, blocks.shape[1])
 
 

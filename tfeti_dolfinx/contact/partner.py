@@ -10,11 +10,10 @@ from numbers import Real
 from typing import Self, TypeAlias
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
 from tfeti_dolfinx.common.logging import cite
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, least
 from tfeti_dolfinx.common.validation import checked_type, is_whole, shown
 from tfeti_dolfinx.contact.friction import FrictionLaw, numbers_at, with_friction
 from tfeti_dolfinx.contact.records import ContactRecords, Side, conditions, relative_motion
@@ -432,7 +431,7 @@ class Contact(ContactPartner):
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
         """Return gaps of its conditions; those of the geometry may not overlap too deep."""
         found = super().gaps(dofs, records, depth)
-        deepest = -dofs.comm.allreduce(float(found.min(initial=0.0)), op=MPI.MIN)
+        deepest = -least(dofs.comm, float(found.min(initial=0.0)))
         if isinstance(self.gap, str) and deepest > depth:
             raise InputError(
                 f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the reach "

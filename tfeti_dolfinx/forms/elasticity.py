@@ -10,12 +10,11 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from mpi4py import MPI
 from ufl.algorithms import estimate_total_polynomial_degree
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.compat import geometry_degree
-from tfeti_dolfinx.common.parallel import count_over
+from tfeti_dolfinx.common.parallel import count_over, largest, least
 from tfeti_dolfinx.common.validation import POSITIVE, Range, checked_number, checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.checks import check_mesh, check_not_negative
@@ -111,12 +110,11 @@ class Elasticity:
         self.thickness: Any = 1.0
         if self.model == "axisymmetric":
             r, comm = self.mesh.geometry.x[:, 0], self.mesh.comm
-            largest = comm.allreduce(float(np.abs(r).max(initial=0.0)), op=MPI.MAX)
-            least = comm.allreduce(float(r.min(initial=np.inf)), op=MPI.MIN)
-            self._on_axis = self._near_axis * largest
-            if least < -self._on_axis:
+            self._on_axis = self._near_axis * largest(comm, r)
+            lowest = least(comm, float(r.min(initial=np.inf)))
+            if lowest < -self._on_axis:
                 raise InputError(
-                    f"model='axisymmetric': the mesh has points with the radius x[0] = {least:.6g}"
+                    f"model='axisymmetric': the mesh has points with the radius x[0] = {lowest:.6g}"
                     "; expected 0 or more"
                 )
             self.thickness = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]

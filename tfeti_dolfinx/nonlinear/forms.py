@@ -10,7 +10,6 @@ import basix
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 from scipy.sparse import csr_array
 from ufl.algorithms import expand_derivatives
 from ufl.constantvalue import Zero
@@ -18,7 +17,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.parallel import any_rank, least
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -251,5 +250,5 @@ class CurrentPlaces:
 
     def smallest_volume_ratio(self) -> float:
         """Return the smallest det F at points of cells, u as it is now. Collective."""
-        own = float(np.min(self._det.eval(self._mesh, self._cells), initial=np.inf))
-        return float(self._mesh.comm.allreduce(own, op=MPI.MIN))
+        own = np.min(self._det.eval(self._mesh, self._cells), initial=np.inf)
+        return least(self._mesh.comm, float(own))

@@ -12,7 +12,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, largest, summed
+from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
@@ -272,7 +272,7 @@ class NonlinearContactProblem(ContactProblem):
         along = forms.stiffness() @ d
         self._set(u + h * d)
         apart = (forms.residual() - before) / h - along
-        off, size = np.sqrt(self._total(np.array([apart @ apart, along @ along])))
+        off, size = np.sqrt(dot_over(self.decomposition.comm, (apart, apart), (along, along)))
         if self._has_own_tangent and off > tol.another * size:
             return (
                 "a tangent J that is the derivative of F, as J2Plasticity.tangent(w, v) is that of "
@@ -291,9 +291,8 @@ class NonlinearContactProblem(ContactProblem):
             self._set(moved.x.array)
             found.append(forms.residual())
         self._set(u)
-        rest, stretched, turned = found
-        own = np.array([np.sum((turned - stretched) ** 2), np.sum((stretched - rest) ** 2)])
-        apart, size = np.sqrt(self._total(own))
+        apart, stretch = found[2] - found[1], found[1] - found[0]
+        apart, size = np.sqrt(dot_over(self.decomposition.comm, (apart, apart), (stretch, stretch)))
         if apart <= self._tolerances.alike * size:
             raise InputError(
                 "finite=True: the residual F takes a rotation for a stretch, as small strain does; "
@@ -350,8 +349,8 @@ class NonlinearContactProblem(ContactProblem):
         diagonal = sum(
             float(block.diagonal @ primal[part] ** 2) for block, part in subdomains.block_parts
         )
-        own = [sum(subdomains.energies(primal)), diagonal, at_u @ d]
-        energy, diagonal, slope = map(float, self._total(np.array(own)))
+        comm, own = subdomains.comm, [sum(subdomains.energies(primal)), diagonal, at_u @ d]
+        energy, diagonal, slope = map(float, steering(comm, *summed(comm, np.array(own))))
         start, rounding = -energy, tol.rounding * diagonal
         forces = start - slope  # λᵀB d, since J d + F(u) + Bᵀλ = 0
         b, high = self._longest(u, d, forces)
@@ -391,13 +390,7 @@ class NonlinearContactProblem(ContactProblem):
         """F(u + t d; d). Collective."""
         self._set(u + t * d)
         self._newton_forms.known = F = self._newton_forms.residual()
-        (slope,) = self._total(np.array([F @ d]))
-        return float(slope)
-
-    def _total(self, own: Array) -> Array:
-        """Sum over ranks, the same on each: it steers them. Collective."""
-        comm = self.decomposition.comm
-        return bcast_from_root(comm, summed(comm, own))
+        return dot_over(self.decomposition.comm, (F, d))[0]
 
     def update(
         self,
