@@ -43,6 +43,7 @@ MESHES = {
     r"mesh of intervals in 1D: expected one of triangle": lambda s: tfeti.decompose(
         dmesh.create_unit_interval(s.comm, 4), 2
     ),
+    r"mesh is torn already; expected the one before": lambda s: tfeti.decompose(s.d.mesh, 2),
     r"the mesh has no cells": lambda s: tfeti.decompose(submesh(s, 2, 0)),
     r"mesh with coordinates of type float32; expected float64": lambda s: tfeti.decompose(
         single(s), 2
@@ -78,7 +79,7 @@ TAGS = {
 
 NAMES = {
     r"no surface 'lid' in the mesh; its surfaces are: 'left' \(1\)": lambda s: s.d.surface("lid"),
-    r"surface 1.5: expected the name or the tag of one surface": lambda s: s.d.surface(1.5),
+    r"surface a Sphere: .*; a shape is met": lambda s: s.d.surface(tfeti.Sphere((0, 0), 1)),
 }
 
 MARKERS = {

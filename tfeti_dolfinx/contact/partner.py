@@ -154,8 +154,8 @@ def position_of(names: Sequence[str], which: int | str) -> int:
         return names.index(which)
     known = ", ".join(f"{i}: {name}" for i, name in enumerate(names)) or "none"
     raise InputError(
-        f"contact {shown(which)}: there are {len(names)}, counted from 0; their positions and "
-        f"names, of which one was expected, are {known}"
+        f"contact {shown(which)}: expected a position or a name that only one of them has, of "
+        f"{known}; name= of Contact and Obstacle gives names"
     )
 
 
@@ -315,9 +315,10 @@ class Obstacle(ContactPartner):
         length = np.linalg.norm(gradient, axis=1)
         wrong = ~(np.isfinite(gap) & np.isfinite(length) & (length > 0.0))
         if np.any(wrong):
+            space = ", in a scalar space: expected displacements" if gdim == 1 else ""
             raise InputError(
-                f"{self.name} has no distance and normal at the node "
-                f"{x[wrong][0].tolist()}: distance {gap[wrong][0]}, gradient {gradient[wrong][0]}"
+                f"{self.name} has no distance and normal at the node {x[wrong][0].tolist()}: "
+                f"distance {gap[wrong][0]}, gradient {gradient[wrong][0]}{space}"
             )
         return gap / length, -gradient / length[:, None]
 

@@ -339,7 +339,8 @@ def _tag(name: str | int, names: dict[str, int], kind: str) -> int:
     if isinstance(name, str) and name in names:
         return names[name]
     if not is_whole(name) and not isinstance(name, str):
-        raise InputError(f"{kind} {shown(name)}: expected the name or the tag of one {kind}")
+        hint = "; a shape is met by an Obstacle" if hasattr(name, "distance") else ""
+        raise InputError(f"{kind} {shown(name)}: expected the name or the tag of one {kind}{hint}")
     raise InputError(f"no {kind} {name!r} in the mesh; its {kind}s are: {known_tags(names)}")
 
 

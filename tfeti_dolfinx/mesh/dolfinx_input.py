@@ -19,7 +19,7 @@ from tfeti_dolfinx.common.validation import checked_type, is_whole, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names
 from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner
-from tfeti_dolfinx.mesh.tearing import decomposed
+from tfeti_dolfinx.mesh.tearing import TORN, decomposed
 from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_facets
 
 CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
@@ -183,6 +183,8 @@ def _checked_mesh(mesh: Any) -> dmesh.Mesh:
     if topology.index_map(topology.dim).size_global == 0:
         raise InputError("the mesh has no cells")
     with raised_on_all_ranks(mesh.comm):
+        if mesh in TORN:
+            raise InputError("mesh is torn already; expected the one before, of whole bodies")
         x = mesh.geometry.x
         if x.dtype != np.float64:
             raise InputError(f"mesh with coordinates of type {x.dtype}; expected float64")

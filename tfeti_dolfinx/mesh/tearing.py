@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from weakref import WeakSet
 
 import numpy as np
 from dolfinx import mesh as dmesh
@@ -26,6 +27,8 @@ from tfeti_dolfinx.mesh.partition import (
     make_parts,
 )
 from tfeti_dolfinx.mesh.untorn import NO_TAG, UntornMesh, cell_facets
+
+TORN: WeakSet[dmesh.Mesh] = WeakSet()  # meshes torn here: their bodies are in pieces
 
 # --- Subdomains on ranks ----------------------------------------------------------------------
 
@@ -150,6 +153,7 @@ def tear(
     node, start = copies % count, offset_of(comm, len(copies))
     cells = start + cells.reshape(share.cells.shape)
     mesh = create_mesh_in_place(comm, cells, share.x[node], share.element)
+    TORN.add(mesh)
     cell = order[np.asarray(mesh.topology.original_cell_index) - offset_of(comm, len(cells))]
     facets, tdim = cell_facets(mesh), mesh.topology.dim
     boundary = np.sort(facets[on_boundary[cell]])
