@@ -60,10 +60,6 @@ def modules():
     return sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.stem != "__init__")
 
 
-def room_of(path):
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-
-
 def imported_rooms(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("tfeti_dolfinx."):
@@ -73,7 +69,7 @@ def imported_rooms(path):
 def test_imports_go_one_way():
     wrong = []
     for path in modules():
-        own = room_of(path)
+        own = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         for room in imported_rooms(path):
             if room != own and (PLACE[room] >= PLACE[own] or (own, room) in APART):
                 wrong.append(f"{path.relative_to(PACKAGE)} imports {room}")

@@ -9,12 +9,13 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 from scenes import clamp, decomposed, forms, hooke, problem, strain
-from scipy.sparse import csr_array, diags_array, tril
+from scipy.sparse import csr_array, diags_array, eye_array, tril
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import as_petsc_matrix
 from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
+from tfeti_dolfinx.feti.preconditioner import ContactFactor
 from tfeti_dolfinx.subdomains import factor
 from tfeti_dolfinx.subdomains import sparse_block as traced
 from tfeti_dolfinx.subdomains.block import SubdomainData, candidate_modes, kernel_of
@@ -181,6 +182,24 @@ def test_every_solver_factors_and_what_stands_in_for_cholmod_is_said_once(solver
         problem(d, (0.0, -0.05)).solve()
     said = [r.getMessage() for r in caplog.records if "built without CHOLMOD" in r.getMessage()]
     assert len(said) == (solver != "cholmod" and d.comm.rank == 0)
+
+
+@pytest.mark.parametrize("whole", [0, 99])
+def test_a_factor_of_contact_rows_is_shared_by_ranks_or_whole_on_each(comm, whole):
+    K = diags_array([[-1.0] * 39, [2.5] * 40, [-1.0] * 39], offsets=[-1, 0, 1]).tocsr()
+    x, own = np.arange(40.0), slice(*(40 * np.array([comm.rank, comm.rank + 1]) // comm.size))
+    layout = 2 * ((own.stop - own.start, 40),)
+    for change in (3.0, 0.0):  # the first one is indefinite
+        part = csr_array(K - change * eye_array(40))[own]
+        A = PETSc.Mat().createAIJ(layout, csr=(part.indptr, part.indices, part.data), comm=comm)
+        if change:
+            kept = A.createVecLeft()  # PETSc's communicator ends with its last object
+            with pytest.raises(NotPositiveDefiniteError, match="not positive definite"):
+                ContactFactor(A, "tfeti_face_", whole)
+    found = ContactFactor(A, "tfeti_face_", whole)
+    assert np.allclose(found.solve((K @ x)[own]), x[own], atol=1e-12)
+    found.destroy()
+    kept.destroy()
 
 
 def test_a_solver_that_is_missing_is_named():

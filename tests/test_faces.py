@@ -72,10 +72,6 @@ FACES = {
 }
 
 
-def random_vector(dual, seed):
-    return np.random.default_rng(10 * seed + dual.coarse.comm.rank).standard_normal(len(dual.d))
-
-
 def gathered(dual, rows):
     """Rows of all ranks, dense."""
     return np.concatenate(dual.coarse.comm.allgather(np.asarray(rows)))
@@ -86,7 +82,7 @@ def test_projectors_of_a_face(dual, kind):
     """P is idempotent, symmetric, kills Z G_fᵀ and what is not in Z, and is the dense one."""
     face = FACES[kind](dual)
     coarse, comm = dual.coarse.on_face(face), dual.coarse.comm
-    x, y = (random_vector(dual, seed) for seed in range(2))
+    x, y = np.random.default_rng(comm.rank).standard_normal((2, len(dual.d)))
     Px, Py, Qx = coarse.project(x), coarse.project(y), coarse.Q(x)
     one, other = dot_over(comm, (Px, y), (x, Py))
     assert abs(one - other) <= 1e-10 * norm_over(comm, x) * norm_over(comm, y)
@@ -117,16 +113,12 @@ def test_the_particular_solution_of_a_face(dual, kind):
         assert np.linalg.norm(left) <= 1e-9 * np.linalg.norm(dual.coarse.e)
 
 
-def pairs_and_rows():
-    """The first 20 rows, one direction in each of 5 pairs, and no rows of the last 10."""
-    return around(np.arange(40) < 20, np.arange(20, 30), np.arange(5.0), Status.FREE)
-
-
 @pytest.mark.parametrize(("preconditioned", "with_coarse"), [(False, True), (True, False)])
 def test_pcpg_on_a_face(preconditioned, with_coarse):
     """It moves in the face alone, keeps Gλ, and knows the gradient on all rows."""
     F, d, G, e, _ = random_program(4)
-    face = pairs_and_rows()
+    # the first 20 rows, one direction in each of 5 pairs, and no rows of the last 10
+    face = around(np.arange(40) < 20, np.arange(20, 30), np.arange(5.0), Status.FREE)
     Z = face.Z.toarray()
     coarse = DenseCoarse(G, e) if with_coarse else DenseCoarse(np.zeros((0, 40)), np.zeros(0))
     qp = QP(matrix(F), vector(d), coarse, Product())

@@ -44,12 +44,6 @@ def dual(request):
     p.destroy()
 
 
-def face_with_half_of_the_contacts(dual):
-    free = np.ones(dual.constraints.num_rows, dtype=bool)
-    free[dual.constraints.sets.normals[::2]] = False
-    return Face(free, np.where(free, Status.TOUCHING, Status.OPEN))
-
-
 def count(qp, num_steps):
     """Global calls of so many steps, with what comes before and after them."""
     start = homogenise(qp)
@@ -64,7 +58,9 @@ def count(qp, num_steps):
 @pytest.mark.parametrize(("on_face", "preconditioned"), [(False, False), (True, True)])
 def test_a_step_of_pcpg_makes_three_reductions(dual, on_face, preconditioned):
     qp = dual.qp()
-    face = face_with_half_of_the_contacts(dual)
+    free = np.ones(dual.constraints.num_rows, dtype=bool)
+    free[dual.constraints.sets.normals[::2]] = False
+    face = Face(free, np.where(free, Status.TOUCHING, Status.OPEN))
     preconditioner = qp.preconditioner_on(face) if on_face else qp.preconditioner
     if on_face:
         qp = replace(qp, coarse=qp.coarse.on_face(face))

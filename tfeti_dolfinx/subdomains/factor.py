@@ -50,16 +50,18 @@ class NotPositiveDefiniteError(FactorError, ArithmeticError):
 
 
 class CholeskyFactor:
-    """A = L Lᵀ of a symmetric positive definite matrix on one rank.
+    """A = L Lᵀ of a symmetric positive definite matrix on one rank, or of PETSc's on several.
 
     Creation raises a NotPositiveDefiniteError where A is not positive definite; a FactorError where
     there is no memory for the factor, PETSc has no such solver, or it fails. A is a matrix of scipy
-    or ``Entries``, both triangles, and may go after it; PETSc's options ``pc_factor_...`` and
-    ``mat_...`` with the prefix are heeded.
+    or ``Entries``, both triangles, and may go after it; one of PETSc is destroyed. PETSc's options
+    ``pc_factor_...`` and ``mat_...`` with the prefix are heeded, but for the solver on several
+    ranks, which is MUMPS: there all methods are collective, and b and x this rank's parts.
     """
 
     def __init__(self, A: Any, prefix: str = "tfeti_sub_") -> None:
-        matrix, pc = as_petsc_matrix(A), PETSc.PC().create(PETSc.COMM_SELF)
+        matrix = A if isinstance(A, PETSc.Mat) else as_petsc_matrix(A)
+        pc = PETSc.PC().create(matrix.getComm())
         # not SPD, which is what the factor is to find out; MUMPS would not look at signs then
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._b, self._x = matrix.createVecs()
@@ -82,7 +84,7 @@ class CholeskyFactor:
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
-        if b.size == 0:
+        if 0 in (self._b.getSize(), *b.shape[1:]):
             return np.array(b)
         if b.ndim == 2:
             return of_columns(self._solved, b, len(b))
@@ -94,6 +96,11 @@ class CholeskyFactor:
         found = given.duplicate()
         self._factor.matSolve(given, found)
         return found
+
+    def destroy(self) -> None:
+        """Destroy PETSc's objects."""
+        for item in (self._b, self._x, self._factor):
+            item.destroy()
 
 
 @contextmanager
@@ -171,6 +178,8 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
     given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
     with added_options(prefix, given):
         pc.setFromOptions()
+        if matrix.getComm().size > 1:
+            pc.setFactorSolverType("mumps")
         pc.setUp()
     reason = pc.getFailedReason()
     if reason == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:
