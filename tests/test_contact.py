@@ -11,7 +11,6 @@ from scenes import curved_obstacle, decomposed, displacement, hooke, problem, re
 import tfeti_dolfinx as tfeti
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
-
 SMALSE = {"tfeti_qp_type": "smalse"}
 
 

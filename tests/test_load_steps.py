@@ -23,7 +23,6 @@ def test_a_block_pushed_and_pulled_back_slips_as_in_closed_form(cell):
     """Shear, slip and dissipation of each step; u is linear, so that the mesh does not matter."""
     scene = Sheared(cell, 3)
     comm = scene.problem.decomposition.comm
-
     for n, top in enumerate(PATH):
         scene.top.value = top
         scene.problem.solve()

@@ -260,9 +260,9 @@ def test_a_free_body_slides_on_both_sides(comm):
             assert abs(Q - sign * mu * N) < 1e-4 * abs(N)
 
 
-def two_blocks(degree):
+def two_blocks(degree, **where):
     """Two blocks of neo-Hooke that do not match, ν = 0, and what moves the upper one."""
-    decomposition = stacked("triangle", 3, 4, 4)
+    decomposition = stacked("triangle", 3, 4, 4, **where)
     V, u, v, _ = unknowns(decomposition, degree)
     F = ufl.derivative(neo_hooke(u, E, 0.0) * ufl.dx(**DX), u, v)
     value = fem.Constant(decomposition.mesh, 0.0)
@@ -300,15 +300,23 @@ def test_a_closed_elastic_cycle_ends_where_it_began(comm):
 def test_patch_of_two_finite_bodies_is_exact(degree, moves, comm):
     """Two blocks that do not match, pressed by a quarter at most: homogeneous strain, ν = 0."""
     decomposition, u, F, value, bcs = two_blocks(degree)
-    contacts, options = [tfeti.Contact("lower top", "upper bottom")], {"rtol": 1e-10}
-    problem = tfeti.NonlinearContactProblem(
-        F, u, bcs, contacts, decomposition, finite=True, petsc_options=options
-    )
+    given = (F, u, bcs, [tfeti.Contact("lower top", "upper bottom")], decomposition)
+    problem = tfeti.NonlinearContactProblem(*given, finite=True, petsc_options={"rtol": 1e-10})
     for value.value in moves:
         accepted(problem)
     height = ufl.SpatialCoordinate(decomposition.mesh)[1]
     exact = ufl.as_vector((0, 0.5 * moves[-1] * (1 + height)))
     assert integral(ufl.inner(u - exact, u - exact) * ufl.dx) ** 0.5 < 1e-9
+
+
+def test_a_small_step_of_two_finite_bodies_is_linear():
+    d, u, F, value, bcs = two_blocks(2, upper=(0.2, 0.7))  # facets are straight, u is not
+    value.value, zero = -1e-3, ufl.ZeroBaseForm(F.arguments())
+    contacts = [tfeti.Contact("upper bottom", "lower top", secondary="upper bottom")]
+    linear = tfeti.ContactProblem(ufl.derivative(F, u), zero, bcs, contacts, d)
+    linear.solve()
+    accepted(tfeti.NonlinearContactProblem(F, u, bcs, contacts, d, finite=True))
+    assert largest(u.x.array - linear.u.x.array) < 3e-6
 
 
 def small(comm):

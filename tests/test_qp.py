@@ -143,7 +143,6 @@ def test_smalse_converges_whatever_M_and_beta_are(seed, beta, exponent):
 # is too small: ‖A‖ᾱ ≤ 2 needs 0.975 of the norm
 LEAST, MOST = 0.975, 1.1
 SIZE = 60
-
 SPECTRA = {
     "one eigenvalue apart": np.append(np.linspace(0.1, 1.0, SIZE - 1), 5.0),
     "evenly spread": np.linspace(0.01, 1.0, SIZE),

@@ -58,7 +58,6 @@ def test_other_values_and_gaps_cost_a_vector(cell, degree):
     values, gaps = prescribe(scene.dofs, new).value, scene.search.records.gap
     expected = np.array(anew.constraints.c)
     assert np.array_equal(gluing.right_side(), first)
-
     updated = gluing.with_right_side(values, gaps)
     assert updated.constraints is gluing.constraints
     assert np.allclose(c, expected, rtol=1e-14, atol=1e-15)

@@ -29,9 +29,10 @@ class ContactSearch:
     those that a displacement violates, ``widen`` to those that may hold a body yet. Creation raises
     an InputError where a pair is there twice, or a contact raises it. ``stiffness`` is the block of
     K of each primal node, shape ``(num_nodes, bs, bs)``; without it sides are decided. ``origin``
-    is the displacement in primal order at which the mesh is, by default 0: gaps are those of the
-    total one. Tools are where they are placed. ``flag`` says which components of owned groups are
-    prescribed, shape ``(g, bs)``; None: none.
+    has the displacements in primal order at which nodes and facets are, by default 0: gaps are
+    those of the total one. Obstacles meet nodes, pairs facets, which a mesh of degree 1 has
+    straight where u is of degree 2. Tools are where they are placed. ``flag`` says which
+    components of owned groups are prescribed, shape ``(g, bs)``; None: none.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
@@ -129,7 +130,7 @@ class ContactSearch:
         Where surfaces have moved farther than the search went, it is done again. Return how many
         rows are new, on all ranks.
         """
-        way = u if self._origin is None else u - self._origin
+        way = u if self._origin is None else u - self._origin[1]
         comm, count = self._dofs.comm, 0
         for i, contact in enumerate(self.contacts):
             moved = 0.0
@@ -223,7 +224,9 @@ class ContactSearch:
             found = replace(found, motion=self._tools.motion_there(found))
         gap = found.gap
         if self._origin is not None:
-            way = relative_displacement(found, self._dofs, self._origin)
+            nodes, facets = (relative_displacement(found, self._dofs, u) for u in self._origin)
+            pair = np.array([len(contact.surfaces) > 1 for contact in self.contacts], dtype=bool)
+            way = np.where(pair[found.contact, None], facets, nodes)
             # a bound from above does not follow u: Newton's method would close that gap a step
             gap = np.maximum(gap, found.mean_gap)
         elif self._tools:

@@ -214,7 +214,11 @@ class InertialNewtonForms(NewtonForms):
 
 
 class CurrentPlaces:
-    """The places X + u of a mesh and of its nodes. Creation and ``move`` are collective."""
+    """The places X + u of a mesh and of its nodes. Creation and ``move`` are collective.
+
+    Attributes:
+        moved: The displacement of the mesh, u as far as its degree has it.
+    """
 
     def __init__(self, u: fem.Function, dofs: TornDofs) -> None:
         V = u.function_space
@@ -237,6 +241,8 @@ class CurrentPlaces:
             self._here = np.array(self._u.x.array)
         self._moving.x.array[:] = self._here
         self._at_points.interpolate(self._moving)
+        self._moving.interpolate(self._at_points)
+        self.moved = self._moving.x.array
         moved = self._at_points.x.array.reshape(-1, gdim)
         self._mesh.geometry.x[self._to, :gdim] = self._points[self._to, :gdim] + moved[self._from]
         nodes = self._nodes.copy()

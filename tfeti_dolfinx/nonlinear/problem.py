@@ -331,7 +331,8 @@ class NonlinearContactProblem(ContactProblem):
         """Let contact and rigid motions be those of X + u. Collective."""
         places.move(anew=not self._newton_forms.kept)
         if not self._newton_forms.kept:
-            self._system.origin = self.dofs.to_primal(self.u.x.array)
+            moved = (self.u.x.array, places.moved)
+            self._system.origin = np.stack([self.dofs.to_primal(u) for u in moved])
         self._system.begin_at(self.dofs.to_primal(self._begin))
 
     def _set(self, u: Array) -> None:
