@@ -169,7 +169,7 @@ GIVEN = [
     r"\b[1-3]D\b",
     r"[Dd]egrees? [12](?: and 2)?\b",
     r"DOLFINx(?: ≥)? 0\.\d+",
-    r"Debian 1\d( or 13)?",
+    r"(Debian 1|Ubuntu 26.0)\d( or 13)?",
     r"^\| 0\.\d+ \|.*$",
     r"\bb[₀12]\b|h²/8R|2πr|x\[0\]|u_r = 0|73, 2008|CB1|SSNV506|ADIOS2|rtol 1e-8|below 1\.",
     r"200/√2|200 down|radius 10|size (?:0\.5|3)|down by 0\.1|^of 0\.05|near(?: to)? 0\.5",
