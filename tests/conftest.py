@@ -12,6 +12,7 @@ import pytest
 import quick_demos
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from hypothesis.internal.conjecture import providers
 from mpi4py import MPI
 
 # a failure on one rank alone must end the test: others would not take part in shrinking it
@@ -24,6 +25,9 @@ settings.register_profile(
     phases=[Phase.explicit, Phase.generate],
 )
 settings.load_profile("ranks")
+# newer versions draw from constants of the modules loaded, and ranks do not load the same ones
+if hasattr(providers, "_get_local_constants"):
+    providers._get_local_constants = lambda none=providers._local_constants: none
 
 LATER = 1.1  # pytest-timeout, which names the test, comes first where it can
 STDERR = pytest.StashKey[int]()
@@ -85,14 +89,10 @@ def draw_nothing(nothing):
     """Hypothesis asks once who refers to its random numbers: of what is frozen nobody knows."""
 
 
-@pytest.fixture(scope="session")
-def hypothesis_is_ready():
-    draw_nothing()
-
-
 @pytest.fixture(scope="module", autouse=True)
-def keep_what_stays(hypothesis_is_ready):
+def keep_what_stays():
     """Modules live as long as the process: to look through them after each test takes longest."""
+    draw_nothing()
     gc.collect()
     gc.freeze()
 

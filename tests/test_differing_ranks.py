@@ -260,7 +260,7 @@ CASES = {
     ),
     "data of an unknown contact on one": (
         of_solution(lambda of: of.contact(0), lambda of: of.contact(3 if ODD else 0)),
-        "contact 3: there are 2",
+        "contact 3: expected a position or a name",
     ),
     "the reaction of another surface on one": (
         of_solution(lambda of: of.reaction("left"), lambda of: of.reaction("right")),
