@@ -19,12 +19,12 @@ from tempfile import TemporaryDirectory
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = ROOT / "docs/pictures"
 SIZES = {"talk_hertz_2d": ["--subdomains", "32"]}
-# of a benchmark, its name and arguments
+# of a benchmark its name, and on how many ranks it is started
 BENCHMARKS = {
-    "performance_price": ["linear_price"],
-    "performance_talk": ["talk_tables"],
-    "performance_weak": ["scaling"],
-    "time_against_error": ["time_against_error"],
+    "performance_price": ("linear_price", 2),
+    "performance_talk": ("talk_tables", 2),
+    "performance_weak": ("scaling", 1),
+    "time_against_error": ("time_against_error", 1),
 }
 
 
@@ -32,12 +32,15 @@ def main(names: list[str], commit: str | None) -> None:
     """Run demos and benchmarks, all by default, and replace their pictures."""
     demos = {path.stem: path for path in sorted((ROOT / "demos").glob("[a-z]*.py"))}
     for name in names or [*demos, *(BENCHMARKS if commit else ())]:
-        program, *given = BENCHMARKS.get(name, [name, "--plot", *SIZES.get(name, [])])
+        program, ranks = BENCHMARKS.get(name, (name, 1))
+        given = ["--plot", *SIZES.get(name, [])]
         if name in BENCHMARKS:
-            given += ["--document", commit] if commit else []
+            given = ["--document", commit] if commit else []
         with TemporaryDirectory() as folder:
             path = demos.get(name, ROOT / f"benchmarks/{program}.py")
             command = [sys.executable, str(path), *given, "--output", folder]
+            if ranks > 1:
+                command = ["mpirun", "-n", str(ranks), *command]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
             for drawn in sorted(Path(folder).glob(f"{program}*.[gp][in][fg]")):
                 known = PICTURES / (f"{name}.png" if name in BENCHMARKS else drawn.name)
