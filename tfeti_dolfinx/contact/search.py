@@ -62,7 +62,7 @@ class ContactSearch:
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
-        self._records = [self._from_origin(records) for _, records in settled]
+        self._records = [self._from_origin(i, records) for i, (_, records) in enumerate(settled)]
         # primal nodes of the surfaces of each contact
         self._nodes = [
             [np.unique(facet_nodes(dofs, decomposition.facets(name))) for name in contact.surfaces]
@@ -105,7 +105,7 @@ class ContactSearch:
         for i, gap in gaps.items():
             contacts[i] = contacts[i].with_gap(gap)
             values = contacts[i].gaps(self._dofs, records[i], self._depths[i])
-            records[i] = self._from_origin(replace(records[i], gap=values))
+            records[i] = self._from_origin(i, replace(records[i], gap=values))
         self.contacts, self._records = contacts, records
 
     def rows(self) -> tuple[list[float], list[Array]]:
@@ -216,17 +216,17 @@ class ContactSearch:
         known = self._records[i]
         found = self.contacts[i].records(self._dofs, i, reach, self._depths[i], self._flag)
         had_rows = np.isin(found.group, known.group[known.within_reach])
-        return replace(self._from_origin(found), within_reach=had_rows)
+        return replace(self._from_origin(i, found), within_reach=had_rows)
 
-    def _from_origin(self, found: ContactRecords) -> ContactRecords:
-        """Conditions with the gaps of the total displacement."""
+    def _from_origin(self, i: int, found: ContactRecords) -> ContactRecords:
+        """Conditions of contact i with the gaps of the total displacement."""
         if self._tools:  # at their places
             found = replace(found, motion=self._tools.motion_there(found))
         gap = found.gap
         if self._origin is not None:
-            nodes, facets = (relative_displacement(found, self._dofs, u) for u in self._origin)
-            pair = np.array([len(contact.surfaces) > 1 for contact in self.contacts], dtype=bool)
-            way = np.where(pair[found.contact, None], facets, nodes)
+            nodes, facets = self._origin
+            here = facets if len(self.contacts[i].surfaces) > 1 else nodes
+            way = relative_displacement(found, self._dofs, here)
             # a bound from above does not follow u: Newton's method would close that gap a step
             gap = np.maximum(gap, found.mean_gap)
         elif self._tools:
