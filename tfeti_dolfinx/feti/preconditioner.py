@@ -18,7 +18,7 @@ from tfeti_dolfinx.feti.coarse import side_by_side
 from tfeti_dolfinx.feti.operator import DualOperator, LateDirichlet, Metric
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, has_solver
 
 OfArray = Callable[[Array], Array]
 
@@ -325,16 +325,17 @@ def smoothed(steps: list[tuple[float, float]], first: OfArray, then: OfArray, u:
 class ContactFactor:
     """Cholesky factor of an SPD matrix of contact rows, which is taken over.
 
-    With ``whole`` rows at most it is whole on each rank: small and sparse, it takes one gather, in
-    a tenth of the time. With more MUMPS shares it, so that what a rank holds does not grow with the
-    surfaces that touch. All methods are collective; creation raises a FactorError where it fails.
+    With ``whole`` rows at most it is whole on each rank: small and sparse, it takes one gather, and
+    less time. With more MUMPS, where PETSc has it, shares it, so that what a rank holds does not
+    grow with the surfaces that touch. All methods are collective; creation raises a FactorError
+    where it fails.
     """
 
     def __init__(self, A: PETSc.Mat, prefix: str, whole: int = PARAMETERS.whole) -> None:
         self._comm, size = A.getComm().tompi4py(), A.getSize()[0]
         first, last = A.getOwnershipRange()
         self._own, self._sizes, matrix = slice(first, last), list[int](), A
-        if self._comm.size == 1 or size <= whole:
+        if self._comm.size == 1 or size <= whole or not has_solver("mumps"):
             self._sizes = [int(count) for count in np.diff(A.getOwnershipRanges())]
             indptr, indices, data = A.getValuesCSR()
             A.destroy()
