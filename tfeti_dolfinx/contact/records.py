@@ -50,7 +50,6 @@ class ContactRecords:
     frame: Array
     gap: Array  # distance g_i, a length, shape (n,)
     geometric_gap: Array  # the distance that the geometry has, whatever a user gives, shape (n,)
-    mean_gap: Array  # that without bounds: it follows displacements, as rows do, shape (n,)
     # the distance between the smooth surfaces that the facets of both sides stand for, shape (n,)
     curved_gap: Array
     # whether the facets change the gap by more than that of the smooth surfaces varies from node to
@@ -161,9 +160,8 @@ def conditions(
     vertices, areas = integrals.vertices, area[chosen]
     # what rounding of coordinates may make of a gap
     rounding = SEARCH.no_gap * largest(dofs.comm, dofs.V.mesh.geometry.x)
-    gap, mean, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen, rounding)
-    curved = integrals.curved_gap
-    curved_gap, _, spread = _mean_gaps(dofs, vertices, curved, areas, chosen, rounding)
+    gap, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen, rounding)
+    curved_gap, spread = _mean_gaps(dofs, vertices, integrals.curved_gap, areas, chosen, rounding)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, integrals.entries)
@@ -178,7 +176,6 @@ def conditions(
         frame=frames(side.normals[chosen]),
         gap=gap,
         geometric_gap=gap,
-        mean_gap=mean,
         curved_gap=curved_gap,
         conforms=np.abs(curved_gap - gap) > np.maximum(spread, rounding),
         area=areas,
@@ -199,18 +196,18 @@ def conditions(
 
 def _mean_gaps(
     dofs: TornDofs, vertices: Array, gap: GapIntegrals, area: Array, chosen: Array, rounding: float
-) -> tuple[Array, Array, Array]:
-    """∫ψ_i g / ∫ψ_i in the bounds on g, as ψ_i may be negative, without them, and their width.
+) -> tuple[Array, Array]:
+    """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
 
-    Means up to ``rounding`` are 0. Collective.
+    Where nodes have moved there is none from above, which does not follow u as rows do: Newton's
+    method would close that gap a step. Means up to ``rounding`` are 0. Collective.
     """
     groups = vertices.ravel()
     total = dofs.reduce_on_owners(groups, gap.total.ravel())[chosen]
     low = dofs.reduce_on_owners(groups, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduce_on_owners(groups, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
-    mean = total / area
-    both = np.stack((np.clip(mean, low, high), mean))
-    return *np.where(np.abs(both) <= rounding, 0.0, both), high - low
+    mean = np.clip(total / area, low, high if dofs.nodes is None else np.inf)
+    return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:

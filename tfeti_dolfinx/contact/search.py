@@ -222,15 +222,12 @@ class ContactSearch:
         """Conditions of contact i with the gaps of the total displacement."""
         if self._tools:  # at their places
             found = replace(found, motion=self._tools.motion_there(found))
-        gap = found.gap
         if self._origin is not None:
             nodes, facets = self._origin
             here = facets if len(self.contacts[i].surfaces) > 1 else nodes
             way = relative_displacement(found, self._dofs, here)
-            # a bound from above does not follow u: Newton's method would close that gap a step
-            gap = np.maximum(gap, found.mean_gap)
         elif self._tools:
             way = -found.motion
         else:
             return found
-        return replace(found, gap=gap + np.sum(found.normal * way, axis=1))
+        return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))
