@@ -42,14 +42,14 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     element = basix.create_element(basix.ElementFamily.P, cell, 1)
     middle = basix.geometry(cell).mean(axis=0)[None]
     slopes = element.tabulate(1, middle)[1:, 0, :, 0]
-    J = np.tensordot(mesh.geometry.x[corners, :gdim], slopes, (1, 1))
+    J = np.moveaxis(mesh.geometry.x.T[:gdim, corners] @ slopes.T, 2, 1)  # cells come last
     # J⁻¹ is the adjugate over the determinant, turned
     if gdim == 2:
-        adjugate = J[:, ::-1, ::-1] * [[1.0, -1.0], [-1.0, 1.0]]
+        adjugate = J[::-1, ::-1] * [[[1.0], [-1.0]], [[-1.0], [1.0]]]
     else:
-        adjugate = np.cross(J[:, [1, 2, 0]], J[:, [2, 0, 1]])
-    volume = np.abs(np.einsum("ni,ni->n", J[:, 0], adjugate[:, 0]))
-    sizes = np.sqrt([np.einsum("nij,nij->n", A, A) for A in (J, adjugate)]).prod(axis=0)
+        adjugate = np.cross(J[[1, 2, 0]], J[[2, 0, 1]], axis=1)
+    volume = np.abs((J[0] * adjugate[0]).sum(axis=0))
+    sizes = np.sqrt((J**2).sum(axis=(0, 1)) * (adjugate**2).sum(axis=(0, 1)))
     return np.asarray(sizes / np.maximum(gdim * volume, TINY * sizes))
 
 
@@ -123,7 +123,7 @@ class Diagnostics:
         """Sentences beside the ``outcome``, each of which names the thing. Collective."""
         if self._of is None or self._of() is not dual:
             nodes = self._points(dual.subdomains)
-            lasting = (self._cells(), self._locking(dual.subdomains, nodes), self._hinges)
+            lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             # mean slopes of a displacement of each subdomain, (gdim, nodes)
             self._slopes = [np.linalg.pinv(own, EPSILON * len(own)) for own in nodes]
@@ -137,14 +137,16 @@ class Diagnostics:
             *_of_estimates(outcome),
         ]
 
-    def _cells(self) -> Iterator[str]:
+    @cached_property
+    def _cells(self) -> list[str]:
         """Cells that are far from regular."""
         worst = largest(self._dofs.comm, flatness(self._decomposition.mesh))
-        if worst > LIMITS.flat:
-            yield (
-                f"cells: the flattest is about {2.0 * worst:.0e} times as long as thick; forces "
-                "and iterations suffer from more than 10"
-            )
+        if worst <= LIMITS.flat:
+            return []
+        return [
+            f"cells: the flattest is about {2.0 * worst:.0e} times as long as thick; forces "
+            "and iterations suffer from more than 10"
+        ]
 
     @cached_property
     def _hinges(self) -> list[str]:
