@@ -8,7 +8,6 @@ from petsc4py import PETSc
 from quick_demos import alone, process
 from scenes import STAGES, decomposed, problem
 
-import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import InputError
 from tfeti_dolfinx.common.validation import parameters_of
 from tfeti_dolfinx.options import Options, factor_options, parse_options
@@ -21,11 +20,6 @@ def test_values_get_the_type_of_their_option():
     given = {"tfeti_rtol": "1e-8", "max_it": "7", "-tfeti_monitor": None, "view": "false"}
     options = parse_options(given, "tfeti_")
     assert (options.rtol, options.max_it, options.monitor, options.view) == (1e-8, 7, True, False)
-
-
-def test_a_name_of_former_programs_says_where_it_is():
-    with pytest.warns(DeprecationWarning, match="import Options from tfeti_dolfinx.options"):
-        assert tfeti.Options is Options
 
 
 def test_the_command_line_beats_the_dictionary():

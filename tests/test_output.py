@@ -170,8 +170,6 @@ def test_pictures(solution, comm, shared_tmp):
         plot_deformed(shared_tmp / f"status{name}", solution, show="status", unit="MPa"),
         plot_pressure(shared_tmp / f"pressure{name}", solution, lambda x: x[0], lambda x: 0 * x),
     ]
-    with pytest.warns(DeprecationWarning, match="as x"):  # functions of former programs
-        plot_pressure(files[-1], solution, lambda x: x[:, 0])
     comm.barrier()
     if comm.rank == 0:
         for file in files:

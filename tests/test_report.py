@@ -34,8 +34,6 @@ def test_every_stage_has_its_seconds(report):
     assert all(value >= 0.0 for value in report.seconds.values())
     total = sum(value for name, value in report.seconds.items() if name != "total")
     assert report.seconds["total"] == pytest.approx(total, rel=0.2)
-    with pytest.warns(DeprecationWarning, match=r"seconds\['qp'\] is called 'solve'"):
-        assert report.seconds["qp"] == report.seconds["solve"]
 
 
 def test_json_has_every_field(report, comm, shared_tmp):

@@ -28,8 +28,6 @@ Example:
     0.100000
 """
 
-import warnings
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus
@@ -114,23 +112,8 @@ __all__ = [
 ]
 
 
-# where what is not for every program is: its names here are those of former programs
-ELSEWHERE = {
-    "Estimates": "accuracy.estimates",
-    "Extensions": "extensions",
-    "Interior": "bem.interior",
-    "Options": "options",
-    "PointValues": "solution",
-    "StepRecord": "steps.load_steps",
-}
-
-
 def __getattr__(name: str) -> Any:
-    """Return a name of an optional part, imported when it is asked for, or one from elsewhere."""
-    if name in ELSEWHERE:
-        module = f"{__name__}.{ELSEWHERE[name]}"
-        warnings.warn(f"import {name} from {module}", DeprecationWarning, stacklevel=2)
-        return getattr(import_module(module), name)
+    """Return a name of an optional part, imported when it is asked for."""
     if name in __all__ and name in PLUGINS:
         return plugin(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import resource
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from textwrap import TextWrapper
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 from mpi4py import MPI
@@ -259,30 +258,6 @@ class Outcome:
 
 # --- The report -------------------------------------------------------------------------------
 
-
-class Seconds(dict[str, float]):
-    """Map stages to wall seconds, largest over ranks; old names of stages warn and give the new."""
-
-    RENAMED: ClassVar = {
-        "gluing": "constraints",
-        "subdomains": "factors",
-        "dual": "coarse",
-        "qp": "solve",
-    }
-
-    def __missing__(self, key: str) -> float:
-        new = self.RENAMED.get(key)
-        if new not in self:
-            raise KeyError(key)
-        text = f"report.seconds[{key!r}] is called {new!r}"
-        warnings.warn(text, DeprecationWarning, stacklevel=2)
-        return self[new]
-
-    def get(self, key: str, default: Any = None) -> Any:
-        """Return the seconds of a stage, by an old name, too; else the default."""
-        return self[key] if key in self or self.RENAMED.get(key) in self else default
-
-
 PRINTED = 10  # of a list, and lines but for those of contacts; all of it is in the file
 WIDTH = 100  # of the printed lines, but for those of contacts: each has one
 STAGES = 4  # whose seconds are printed, the longest
@@ -299,7 +274,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
     fields of its bases are its own; docs/report.md says what each means.
     """
 
-    seconds: dict[str, float] = field(default_factory=Seconds)  # of each stage, and ``total``
+    seconds: dict[str, float] = field(default_factory=dict)  # of each stage, and ``total``
     motion: dict[str, float] = field(default_factory=dict)  # of bodies with mass: energies, work
     contact_forces: list[list[float]] = field(default_factory=list)  # of bodies with mass: means
     in_all: dict[str, float] = field(default_factory=dict)  # solves, counters, seconds of all
@@ -323,7 +298,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         seconds = {name: max(own.get(name, 0.0) for own in of_ranks) for name in stages}
         total = sum(seconds.values())
         own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
-        return cls(**known, seconds=Seconds(seconds, total=total), in_all=added(before, own))
+        return cls(**known, seconds={**seconds, "total": total}, in_all=added(before, own))
 
     def take(self, other: Report) -> None:
         """Take all fields of another report: a program may hold this one over many solves."""

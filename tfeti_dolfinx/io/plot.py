@@ -7,16 +7,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from dolfinx import plot as dplot
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
@@ -198,7 +195,8 @@ def plot_pressure(
         if limit is not None:
             checked_number(limit, "limit", POSITIVE)
     data = solution.contact(contact)
-    x = _coordinates(coordinate, data.points, comm)
+    with raised_on_all_ranks(comm):
+        x = values_at(coordinate, data.points.T, (len(data.points),), "coordinate of")
     parts = comm.gather((x, data.pressure), root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
@@ -219,22 +217,6 @@ def plot_pressure(
             with written_whole(target) as partial:
                 figure.savefig(partial)
     return target
-
-
-def _coordinates(coordinate: Callable[[Array], Array], points: Array, comm: MPI.Intracomm) -> Array:
-    """Return the coordinate of points, ``(n, 3)``; functions of such points warn. Collective."""
-    size = (len(points),)
-    try:
-        with raised_on_all_ranks(comm):
-            return values_at(coordinate, points.T, size, "coordinate of")
-    except InputError:
-        with suppress(InputError):
-            with raised_on_all_ranks(comm):
-                x = values_at(coordinate, points, size, "coordinate of")
-            text = "coordinate gets points of shape (3, n), as x[0]; expected no x[:, 0]"
-            warnings.warn(text, DeprecationWarning, stacklevel=3)
-            return x
-        raise
 
 
 def plot_friction(
