@@ -167,6 +167,8 @@ class SavedState:
     predicted_image: Array = field(default_factory=lambda: np.zeros(0))  # the same of the predictor
     # D of a nonlinear problem, which rows are scaled with, in primal order; else empty
     weights: Array = field(default_factory=lambda: np.zeros(0))
+    # whether Newton's method keeps places yet, shape (), see `ModelKeeping`
+    freezes: Array = field(default_factory=lambda: np.ones(()))
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
@@ -268,6 +270,7 @@ class SavedState:
             "secondary": self.secondary.tolist(),
             "size": float(self.size),
             "norm": float(self.norm),
+            "freezes": bool(self.freezes),
             "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
             "number of directions": self.directions.shape[2],
         }

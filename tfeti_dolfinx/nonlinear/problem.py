@@ -436,7 +436,7 @@ class NonlinearContactProblem(ContactProblem):
         weights = self._system.weights
         state = replace(super().state(), image=np.zeros(0), directions=np.zeros((0, 2, 0)))
         assert weights is not None
-        state = replace(state, weights=weights)
+        state = replace(state, weights=weights, freezes=np.array(float(self._keeping.freezes)))
         if not self._state.functions:
             return state
         cells = labels_of_cells(self.decomposition)
@@ -470,7 +470,7 @@ class NonlinearContactProblem(ContactProblem):
         if self._state.functions:
             self._state.set_in_cells(state.internal)
         self._begin, self._system.weights = self.dofs.to_dolfinx(state.u), state.weights
-        self._newton_forms.kept = False
+        self._newton_forms.kept, self._keeping.freezes = False, bool(state.freezes)
         self._set(self._begin)
         if self._places is not None:
             self._go_to_places(self._places)
