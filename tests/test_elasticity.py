@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import held
+from bodies import held, stacked
 from dolfinx import fem
 from scenes import box, decomposed, integral, largest, vectors
 
@@ -173,14 +173,16 @@ def test_thick_walls_converge(shape, cell):
     assert 0.9 < slopes[1] < 1.3
 
 
-def test_pressure_of_a_cylinder_on_a_plane(comm):
-    """It is force per area of the ring, on the axis too."""
-    d = decomposed("quadrilateral", 3, 3)
+@pytest.mark.parametrize("degree", [1, 2])
+def test_pressure_of_cylinders_on_a_plane(degree, comm):
+    """It is force per area of the ring, on the axis too, and between meshes that do not match."""
+    d = stacked("quadrilateral", 3, 4, 3)
     elastic = tfeti.Elasticity(d, E=YOUNG, nu=POISSON, model="axisymmetric")
-    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
-    problem = compressed(d, elastic, contacts=[floor], sides=("left",))
-    data, solution = problem.solution.contact(), problem.solution
-    assert np.allclose(data.pressure, PRESSURE, rtol=0, atol=1e-9)
-    assert np.isclose(comm.allreduce(data.area.sum()), np.pi, rtol=1e-12)
-    assert np.isclose(comm.allreduce(data.force.sum()), PRESSURE * np.pi, rtol=1e-8)
+    floor = tfeti.Obstacle("lower bottom", tfeti.Plane((0, -1), (0, 1)))
+    given = {"contacts": [floor, tfeti.Contact("upper bottom", "lower top")], "on": "upper top"}
+    solution = compressed(d, elastic, degree, sides=("lower left", "upper left"), **given).solution
+    for data in map(solution.contact, range(2)):
+        assert np.allclose(data.pressure, PRESSURE, rtol=0, atol=1e-9)
+        assert np.isclose(comm.allreduce(data.area.sum()), np.pi, rtol=1e-12)
+        assert np.isclose(comm.allreduce(data.force.sum()), PRESSURE * np.pi, rtol=1e-8)
     assert np.isclose(solution.body_forces.force[0, 1], PRESSURE * np.pi, rtol=1e-8)

@@ -32,7 +32,12 @@ from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, 
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.forms.assembly import Forms
-from tfeti_dolfinx.forms.checks import check_mesh, check_ring, check_same_space, displacement_space
+from tfeti_dolfinx.forms.checks import (
+    check_mesh,
+    check_same_space,
+    displacement_space,
+    is_axisymmetric,
+)
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -155,14 +160,14 @@ class ContactProblem:
         self._accepted: tuple[Solution | None, Start | None] = (None, None)
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
-        if self.contacts:
-            check_ring(a, self.form_name, self._thickness)
+        ring = bool(self.contacts) and is_axisymmetric(a, self.form_name, self._thickness)
         self._seconds = dict(decomposition.seconds)  # of the next solve
         self.report = Report(seconds=self._seconds)
         with stage("assembly", self._seconds):
             forms = self._forms(a, L, V, form_compiler_options, jit_options)
         with stage("constraints", self._seconds):
             self.dofs = TornDofs(V, decomposition)
+            self.dofs.axisymmetric = ring
             check_not_on_tears(self.bcs, self.dofs)
         forms.thickness = self._thickness
         self._diagnostics = Diagnostics(self.dofs)

@@ -513,8 +513,9 @@ def _ratios(
     sums = []
     for side in sides:
         vertices = side.facets.vertices.ravel()
-        area = dofs.reduce_on_owners(vertices, side.areas.ravel())
-        facets = dofs.reduce_on_owners(vertices, np.full(len(vertices), 1.0 / side.areas.shape[1]))
+        v = side.areas.shape[1]
+        area = dofs.reduce_on_owners(vertices, np.repeat(side.facets.area / v, v))
+        facets = dofs.reduce_on_owners(vertices, np.full(len(vertices), 1.0 / v))
         at = meets & (area > 0.0)
         n = side.normals[at]
         along = np.einsum("gi,gij,gj", n, blocks[at], n)

@@ -7,6 +7,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+import ufl
 from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
@@ -55,8 +56,8 @@ class ContactRecords:
     # whether the facets change the gap by more than that of the smooth surfaces varies from node to
     # node, shape (n,)
     conforms: Array
-    # integral ∫φ_i of the node's hat over the contact surface, of a pair over what the other side
-    # covers of it, shape (n,)
+    # integral ∫φ_i of the node's hat over the contact surface, ∫rφ_i of axisymmetric models, of a
+    # pair over what the other side covers of it, shape (n,)
     area: Array
     covered: Array  # the share of that integral over the whole surface, 1 at an obstacle, (n,)
     # whether a row is made at once; a condition out of reach gets one only if the solution violates
@@ -259,8 +260,9 @@ def condition_areas(
     """
     if isinstance(thickness, float):
         return thickness * records.area
-    volume = hat_integrals(dofs, surfaces, thickness)[records.group]
-    return records.area * volume / hat_integrals(dofs, surfaces)[records.group]
+    measures = (thickness, ufl.SpatialCoordinate(dofs.V.mesh)[0] if dofs.axisymmetric else 1.0)
+    volume, area = (hat_integrals(dofs, surfaces, t)[records.group] for t in measures)
+    return records.area * volume / area
 
 
 def body_forces(points: Array, forces: Array, dofs: TornDofs) -> Resultant:

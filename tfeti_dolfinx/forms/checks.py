@@ -66,23 +66,24 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
         _check_tags(integral, name, decomposition)
 
 
-def check_ring(form: Any, name: str, thickness: Any) -> None:
-    """Raise an InputError if a form has u_r/r of an axisymmetric body, and the thickness is 1."""
-    if isinstance(thickness, ufl.core.expr.Expr) or thickness != 1.0:
-        return
+def is_axisymmetric(form: Any, name: str, thickness: Any) -> bool:
+    """Return whether a form has u_r/r, r = x[0]; raise an InputError if the thickness is 1 then."""
 
     def has(expression: Any, kind: type) -> bool:
         parts = (part for part in unique_pre_traversal(expression) if isinstance(part, Indexed))
-        return any(isinstance(part.ufl_operands[0], kind) for part in parts)
+        found = (part for part in parts if isinstance(part.ufl_operands[0], kind))
+        return any(kind is FormArgument or int(part.ufl_operands[1][0]) == 0 for part in found)
 
     parts = (p for part in form.integrals() for p in unique_pre_traversal(part.integrand()))
-    for above, below in (part.ufl_operands for part in parts if isinstance(part, Division)):
-        if has(above, FormArgument) and has(below, SpatialCoordinate):
-            raise InputError(
-                f"{name} divides a displacement by a coordinate, as that of an axisymmetric body "
-                "does, and thickness is 1: pressures would be forces per length; expected "
-                "thickness=elastic.thickness, or what else the form was multiplied with"
-            )
+    divisions = (part.ufl_operands for part in parts if isinstance(part, Division))
+    ring = any(has(u, FormArgument) and has(r, SpatialCoordinate) for u, r in divisions)
+    if ring and not isinstance(thickness, ufl.core.expr.Expr) and thickness == 1.0:
+        raise InputError(
+            f"{name} divides a displacement by a coordinate, as that of an axisymmetric body "
+            "does, and thickness is 1: pressures would be forces per length; expected "
+            "thickness=elastic.thickness, or what else the form was multiplied with"
+        )
+    return ring
 
 
 def check_not_negative(

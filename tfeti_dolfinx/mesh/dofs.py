@@ -126,6 +126,8 @@ class TornDofs:
         copies: Global primal nodes of the owned groups, by subdomain, shape ``(c,)``.
         copy_subdomains: Their subdomains, shape ``(c,)``.
         nodes: Places of DOLFINx's nodes in finite strain, shape ``(n, 3)``; None: on the mesh.
+        axisymmetric: Whether x[0] is a radius, which integrals over contact surfaces have for a
+            weight.
     """
 
     def __init__(self, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
@@ -143,6 +145,7 @@ class TornDofs:
         starts = np.searchsorted(self.node_subdomain, self.subdomains)
         self.node_offsets = np.append(starts, self.num_nodes)
         self.nodes: Array | None = None
+        self.axisymmetric = False
         self.offsets = chunk_offsets(self.comm, self.num_nodes)
         origin, key = node_keys(V, decomposition)
         self._find_groups(decomposition, origin[self.dolfinx_node], key[self.dolfinx_node])

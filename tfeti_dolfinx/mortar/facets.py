@@ -75,6 +75,7 @@ class FacetKind:
     hats: FacetElement  # P1 (Q1) element of the multipliers
     displacement: FacetElement  # element of the displacement's trace
     geometry: FacetElement  # element of the geometry
+    axisymmetric: bool  # whether integrals are weighted with the radius x[0]
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,7 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
         hats=FacetElement(facet, 1, element.lagrange_variant),
         displacement=FacetElement(facet, element.degree, element.lagrange_variant),
         geometry=FacetElement(facet, geometry.degree, geometry.lagrange_variant),
+        axisymmetric=dofs.axisymmetric,
     )
 
 
@@ -230,6 +232,11 @@ def points(element: FacetElement, x: Array, xi: Array) -> Array:
     return np.einsum("mv,mvd->md", element.values(xi), x[:, : element.size])
 
 
+def radii(kind: FacetKind, x: Array, xi: Array) -> Array:
+    """Radius x[0] at reference coordinates in axisymmetric models, else 1, shape ``(m,)``."""
+    return points(kind.geometry, x, xi)[:, 0] if kind.axisymmetric else np.ones(len(xi))
+
+
 def densities(element: FacetElement, x: Array, xi: Array) -> Array:
     """Area per area of the reference facet, shape ``(m,)``; arguments as of ``points``."""
     nodes = x[:, : element.size]
@@ -262,18 +269,22 @@ def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
 
 
 def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, Array, Array]:
-    """Return facet, reference coordinates, ``(m, tdim)``, and weight of quadrature points."""
+    """Return facet, reference coordinates, ``(m, tdim)``, and weight of quadrature points.
+
+    That of axisymmetric models has the radius, too.
+    """
     xi, w = basix.make_quadrature(getattr(basix.CellType, kind.hats.facet), degree)
     n, q = len(facets), len(w)
     nodes = facets.x - facets.x[:, :1]
     slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), nodes)
     weight = _areas(slopes.reshape(n * q, *slopes.shape[2:])) * np.tile(w, n)
-    return np.repeat(np.arange(n), q), np.tile(xi, (n, 1)), weight
+    facet, xi = np.repeat(np.arange(n), q), np.tile(xi, (n, 1))
+    return facet, xi, weight * radii(kind, facets.x[facet], xi)
 
 
 def hat_areas(kind: FacetKind, facets: Facets) -> Array:
     """∫φ_i over whole facets, shape ``(n, v)``."""
-    facet, xi, weight = whole_facets(kind, facets, 2 * kind.geometry.degree)
+    facet, xi, weight = whole_facets(kind, facets, 2 * kind.geometry.degree + kind.axisymmetric)
     return sum_rows(facet, weight[:, None] * kind.hats.values(xi), len(facets))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points, whole_facets
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points, radii, whole_facets
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments, tangents
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
@@ -193,7 +193,7 @@ class FacetMultipliers:
 
 
 def facet_multipliers(
-    kind: FacetKind, area: Array, facet: Array, xi: Array, weight: Array, near: Array
+    kind: FacetKind, of: Facets, facet: Array, xi: Array, weight: Array, near: Array
 ) -> FacetMultipliers:
     """Multipliers on a facet's part with points: hats if it is near what is held, else dual ones.
 
@@ -207,7 +207,8 @@ def facet_multipliers(
     hats = kind.hats.values(xi)
     covered = sum_rows(place, weight[:, None] * hats, len(facets))
     mass = sum_rows(place, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
-    hardly = covered.sum(axis=1) <= SEARCH.hardly_covered * area[facets]
+    area = of.area[facets] * radii(kind, of.x[facets], np.full((len(facets), xi.shape[1]), 0.5))
+    hardly = covered.sum(axis=1) <= SEARCH.hardly_covered * area
     mass[hardly] = np.eye(kind.hats.size)
     covered[hardly] = 0.0
     dual = covered[:, :, None] * np.linalg.inv(mass)
@@ -235,7 +236,8 @@ def integrate(
         meet = np.ones(len(secondary), dtype=bool)
         meet[corners.secondary[np.minimum(*hats) < 1.0 - SEARCH.held]] = False
         near[meet] = False
-    dual = facet_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight, near)
+    weight = segments.weight * radii(kind, secondary.x[at.secondary], at.xi)
+    dual = facet_multipliers(kind, secondary, at.secondary, at.xi, weight, near)
     if np.any(secondary.held) and np.any(primary.held):
         corner, *held = _held(kind, (secondary, primary), corners, dual.facet)
         dual, used = dual.with_points(kind, *held)
@@ -268,7 +270,7 @@ def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> Mort
     # exact for ψ_i φ_k on plane facets, and enough on curved ones
     facet, xi, weight = whole_facets(kind, facets, 4 * kind.displacement.degree)
     held = facets.held & (kind.displacement.degree > 1)
-    dual = facet_multipliers(kind, facets.area, facet, xi, weight, held)
+    dual = facet_multipliers(kind, facets, facet, xi, weight, held)
     if np.any(held):
         spot, vertex = np.nonzero(held[dual.facet])
         dual, used = dual.with_points(kind, held[dual.facet], spot, vertex)

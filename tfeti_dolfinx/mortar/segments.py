@@ -326,6 +326,7 @@ class _Planes:
 def _degree(kind: FacetKind, secondary: Facets, primary: Facets) -> int:
     """Degree of the quadrature: exact on plane intervals, triangles and parallelograms."""
     exact = 1 + kind.displacement.degree + (SEARCH.curved_degree if kind.geometry.degree > 1 else 0)
+    exact += kind.axisymmetric
     if kind.hats.facet != "quadrilateral":
         return exact
     for facets in (secondary, primary):
