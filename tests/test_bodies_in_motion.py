@@ -79,7 +79,7 @@ def test_three_bodies_move_as_dense_matrices_say(serial_only, case):
     """Quadratic elements, too: the reference bounds what rows bound."""
     problem, tau = falling(*case), 0.15
     stabilised, touched = case[3], set()
-    forms = problem._forms_in_time
+    forms = problem._system.forms
     motion = forms.inertia.motion
     u, v, load = motion.u.copy(), motion.v.copy(), motion.load.copy()
     K, M = forms.K.toarray(), forms.inertia.M.toarray()

@@ -79,7 +79,7 @@ def test_an_obstacle_that_moves_does_work():
 
 def mean(scene, values):
     """Mean of a field over the box, of mass 1."""
-    inertia = scene.problem._forms_in_time.inertia
+    inertia = scene.problem._system.forms.inertia
     mass = (inertia.M @ values.ravel()).reshape(values.shape)
     return scene.problem.decomposition.comm.allreduce(mass.sum(axis=0))
 
@@ -134,7 +134,7 @@ def test_a_step_is_newmark_s_by_dense_matrices():
     found = nodal(scene.problem)
     whole = Thrown("quadrilateral", 3, gap=5.0, thrown=(0.3, 0.1, 0.4), subdomains=1)
     whole.problem.take_step(0.2)
-    forms = whole.problem._forms_in_time
+    forms = whole.problem._system.forms
     u, v = np.zeros_like(forms.inertia.motion.v), forms.inertia.motion.v
     K, M = forms.K.toarray(), forms.inertia.M.toarray()
     if len(u):

@@ -118,7 +118,7 @@ def test_a_linear_body_takes_the_steps_of_the_linear_problem(stabilised, comm):
     u, v, weight = fem.Function(V), ufl.TestFunction(V), fem.Constant(d.mesh, (0.0, -0.02))
     F = ufl.inner(hooke()(u), strain(v)) * ufl.dx - ufl.dot(weight, v) * ufl.dx
     velocity = fem.Function(V)
-    velocity.x.array[:] = scene.problem._forms_in_time.inertia.motion.v
+    velocity.x.array[:] = scene.problem._system.forms.inertia.motion.v
     plane = tfeti.Plane((0.0, -0.02), (0.0, 1.0))
     contact = tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(0.3), reach=1.0, name="plane")
     given = {"mass": 1.0, "velocity": velocity, "stabilised": stabilised}

@@ -203,7 +203,8 @@ class System:
         settings: Settings,
         method: SubdomainMethod | None = None,
     ) -> None:
-        self.forms, self.bcs, self._contacts = forms, bcs, contacts
+        self.forms: Any = forms  # those of nonlinear bodies, or in time, have more
+        self.bcs, self._contacts = bcs, contacts
         self._dofs, self._settings = dofs, settings
         self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)

@@ -159,20 +159,14 @@ class NonlinearContactProblem(ContactProblem):
         given = (a, L, V, self.decomposition, *options)
         return NewtonForms(*given, u=self.u, finite=self._finite)
 
-    @property
-    def _newton_forms(self) -> NewtonForms:
-        forms = self._system.forms
-        assert isinstance(forms, NewtonForms)
-        return forms
-
     def _find(self) -> None:
         begin = np.array(self.u.x.array)
         try:
             self._newton()
             # loads that go on find the tangent of the last step nearer than an elastic one
-            self._newton_forms.kept = not self._finite
+            self._system.forms.kept = not self._finite
         except TfetiError:  # on all ranks
-            self._newton_forms.kept = False
+            self._system.forms.kept = False
             self._set(begin)
             self._start = None  # that of a linearised problem is no end of a load step
             raise
@@ -182,7 +176,7 @@ class NonlinearContactProblem(ContactProblem):
 
     def _newton(self) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
-        forms, asked = self._newton_forms, self._last_increment
+        forms, asked = self._system.forms, self._last_increment
         faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
         keeping = self._keeping
         keeping.begin()
@@ -262,7 +256,7 @@ class NonlinearContactProblem(ContactProblem):
 
     def _advice(self, d: Array) -> str:
         """Say what may help, from the derivative of F along the last step. Collective."""
-        tol, forms, u = self._tolerances, self._newton_forms, np.array(self.u.x.array)
+        tol, forms, u = self._tolerances, self._system.forms, np.array(self.u.x.array)
         h = (
             tol.difference
             * largest(self.decomposition.comm, u)
@@ -282,7 +276,7 @@ class NonlinearContactProblem(ContactProblem):
 
     def _check_rotations(self) -> None:
         """Raise if F takes a rotation for a stretch, as strains of small strain do. Collective."""
-        u, forms = np.array(self.u.x.array), self._newton_forms
+        u, forms = np.array(self.u.x.array), self._system.forms
         c, s = np.cos(self._tolerances.turned) - 1.0, np.sin(self._tolerances.turned)
         moved, gdim, found = fem.Function(self.u.function_space), len(self.u), list[Array]()
         for a, b in ((0.0, 0.0), (c, 0.0), (c, s)):
@@ -315,12 +309,12 @@ class NonlinearContactProblem(ContactProblem):
             self._system.look_for_changes()
             self._solve_in_rounds()
         except TfetiError:  # on all ranks
-            if not self._newton_forms.kept:
+            if not self._system.forms.kept:
                 raise
-            self._newton_forms.kept = self._keeping.kept = False
+            self._system.forms.kept = self._keeping.kept = False
             again = True
         finally:
-            self._newton_forms.known = None
+            self._system.forms.known = None
             if self._places is not None:
                 self._places.back()
         if again:
@@ -329,22 +323,22 @@ class NonlinearContactProblem(ContactProblem):
 
     def _go_to_places(self, places: CurrentPlaces) -> None:
         """Let contact and rigid motions be those of X + u. Collective."""
-        places.move(anew=not self._newton_forms.kept)
-        if not self._newton_forms.kept:
+        places.move(anew=not self._system.forms.kept)
+        if not self._system.forms.kept:
             moved = (self.u.x.array, places.moved)
             self._system.origin = np.stack([self.dofs.to_primal(u) for u in moved])
         self._system.begin_at(self.dofs.to_primal(self._begin))
 
     def _set(self, u: Array) -> None:
         """Take a displacement, and what depends on it. Collective."""
-        self.u.x.array[:], self._newton_forms.known = u, None
+        self.u.x.array[:], self._system.forms.known = u, None
         if self._update is not None:
             with raised_on_all_ranks(self.decomposition.comm), named("update"):
                 self._update()
 
     def _line_search(self, u: Array, d: Array) -> tuple[float, float]:
         """Go to u + t d, and return the length t in (0, 1] and |r(1)/r(0)|. Collective."""
-        tol, at_u = self._tolerances, self._newton_forms.at_model
+        tol, at_u = self._tolerances, self._system.forms.at_model
         subdomains = self._system.subdomains
         primal = subdomains.with_rigid(self.dofs.to_primal(d))
         diagonal = sum(
@@ -390,7 +384,7 @@ class NonlinearContactProblem(ContactProblem):
     def _slope(self, u: Array, d: Array, t: float) -> float:
         """F(u + t d; d). Collective."""
         self._set(u + t * d)
-        self._newton_forms.known = F = self._newton_forms.residual()
+        self._system.forms.known = F = self._system.forms.residual()
         return dot_over(self.decomposition.comm, (F, d))[0]
 
     def update(
@@ -470,7 +464,7 @@ class NonlinearContactProblem(ContactProblem):
         if self._state.functions:
             self._state.set_in_cells(state.internal)
         self._begin, self._system.weights = self.dofs.to_dolfinx(state.u), state.weights
-        self._newton_forms.kept, self._keeping.freezes = False, bool(state.freezes)
+        self._system.forms.kept, self._keeping.freezes = False, bool(state.freezes)
         self._set(self._begin)
         if self._places is not None:
             self._go_to_places(self._places)

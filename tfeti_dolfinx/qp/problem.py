@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import astuple, dataclass, field
 from enum import IntEnum
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -290,26 +290,13 @@ class StoppingRule:
 # --- Monitors ---------------------------------------------------------------------------------
 
 
-class Monitor(Protocol):
-    """Called on all ranks after each step; a monitor may communicate."""
-
-    def __call__(
-        self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
-    ) -> None:
-        """See a step.
-
-        Args:
-            steps: Steps so far.
-            step: Kind of this one: start, cg, expansion, proportioning, outer.
-            x: The iterate, this rank's part.
-            projected_gradient: ‖g^P‖ there.
-            equality: ‖Q x‖ there, how far Gλ = e is from being met; negative: not computed.
-        """
+# called on all ranks after each step, and may communicate: with the steps so far; the kind of this
+# one: start, cg, expansion, proportioning, outer; the iterate, this rank's part; ‖g^P‖ there; and
+# ‖Q x‖, how far Gλ = e is from being met, negative where it was not computed
+Monitor = Callable[[Steps, str, Array, float, float], None]
 
 
-def no_monitor(
-    steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
-) -> None:
+def no_monitor(*step: Any) -> None:
     """Say nothing."""
 
 

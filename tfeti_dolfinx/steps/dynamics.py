@@ -268,7 +268,7 @@ class ContactDynamics(ContactProblem):
             v = self._checked_u(velocity, self.dofs.V, "velocity").x.array
         check_copies(self.u.x.array, self.dofs, "u, the displacement at the start,")
         check_copies(v, self.dofs, "velocity")
-        self._forms_in_time.inertia.move(np.array(self.u.x.array), np.array(v))
+        self._system.forms.inertia.move(np.array(self.u.x.array), np.array(v))
         self._predictor: Predictor | None = None
         if self._stabilised:
             self._predictor = Predictor(self.dofs, self._settings)
@@ -290,19 +290,13 @@ class ContactDynamics(ContactProblem):
             mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
         return mass
 
-    @property
-    def _forms_in_time(self) -> InertialForms | InertialNewtonForms:
-        forms = self._system.forms
-        assert isinstance(forms, InertialForms | InertialNewtonForms)
-        return forms
-
     def take_step(self, size: float) -> None:
         """Say how long the next steps are. Another size than before makes and factors all anew.
 
         Raises:
             InputError: It is not a positive number, or another one on another rank.
         """
-        self._forms_in_time.inertia.take_step(size)
+        self._system.forms.inertia.take_step(size)
 
     def solve(self) -> fem.Function:
         """Solve for the end of the step; see ``ContactProblem.solve``.
@@ -315,7 +309,7 @@ class ContactDynamics(ContactProblem):
         return self.u
 
     def _set_out(self) -> None:
-        inertia, system = self._forms_in_time.inertia, self._system
+        inertia, system = self._system.forms.inertia, self._system
         motion = inertia.motion
         motion.towards = free = motion.free
         if self._predictor is not None:  # what contact allows the bodies without elasticity
@@ -337,11 +331,11 @@ class ContactDynamics(ContactProblem):
         if self.solution is before:
             return
         assert self.solution.v is not None
-        self._forms_in_time.inertia.move(np.array(self.u.x.array), self.solution.v)
+        self._system.forms.inertia.move(np.array(self.u.x.array), self.solution.v)
 
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
-        motion, state = self._forms_in_time.inertia.motion, super().state()
+        motion, state = self._system.forms.inertia.motion, super().state()
         v, load = self.dofs.to_primal(motion.v), self.dofs.to_primal(motion.load)
         state = replace(state, velocity=v, load=load, size=np.array(motion.size))
         if self._predictor is None:
@@ -356,7 +350,7 @@ class ContactDynamics(ContactProblem):
             InputError: As ``ContactProblem.restore``, or the state has no velocities.
         """
         super().restore(state)
-        self.solution.v = self._forms_in_time.inertia.motion.v
+        self.solution.v = self._system.forms.inertia.motion.v
         if self._predictor is None:
             return
         state = state.on_nodes(self.dofs).on_rows(self._system.gluing)
@@ -371,7 +365,7 @@ class ContactDynamics(ContactProblem):
             raise InputError("the state is of a problem without mass; expected velocities")
 
     def _take_motion(self, state: SavedState) -> None:
-        inertia = self._forms_in_time.inertia
+        inertia = self._system.forms.inertia
         inertia.move(*map(self.dofs.to_dolfinx, (state.u, state.velocity, state.load)))
         inertia.motion.towards = inertia.motion.free
         if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
@@ -386,14 +380,14 @@ class ContactDynamics(ContactProblem):
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
         solution = super()._make_solution(u, multipliers, gluing)
-        motion = self._forms_in_time.inertia.motion
+        motion = self._system.forms.inertia.motion
         way = self.dofs.to_dolfinx(u) - motion.towards
         solution.v = motion.start + 2.0 / motion.size * way
         return solution
 
     def _look(self) -> None:
         """Put energies, work and forces into the report."""
-        motion = balance(self._forms_in_time, self._system.dual, self.solution)
+        motion = balance(self._system.forms, self._system.dual, self.solution)
         if self._predictor is not None:
             motion["predictor_multiplications"] = float(self._predictor.multiplications)
         contact, forces = self.solution.gluing.records.contact, self.solution.condition_forces
@@ -452,7 +446,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         flags = {"stabilised": stabilised, "lumped": lumped, "finite": finite}
         given = {"mass": mass, "velocity": velocity, **flags, **others}
         super().__init__(F, u, bcs, contacts, decomposition, **given)
-        self._newton_forms.inertia.motion.load = self._newton_forms.forces()
+        self._system.forms.inertia.motion.load = self._system.forms.forces()
         self._blows: list[Array] = []
 
     def _forms(
@@ -461,19 +455,13 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         given = (self._mass_form(V), a, L, V, self.decomposition, *options)
         return InertialNewtonForms(*given, u=self.u, finite=self._finite)
 
-    @property
-    def _newton_forms(self) -> InertialNewtonForms:
-        forms = self._system.forms
-        assert isinstance(forms, InertialNewtonForms)
-        return forms
-
     def _find(self) -> None:
         if self._places is not None:
             self._go_to_places(self._places)
         try:
             self._system.look_for_changes()
             self._set_out()
-            if self._places is not None and self._newton_forms.inertia.motion.size:
+            if self._places is not None and self._system.forms.inertia.motion.size:
                 self._project_velocity()
         finally:
             if self._places is not None:
@@ -485,7 +473,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
 
         What a node keeps of the velocity with which it hits would work where normals turn.
         """
-        motion, predictor = self._newton_forms.inertia.motion, self._predictor
+        motion, predictor = self._system.forms.inertia.motion, self._predictor
         motion.start, self._blows = motion.v, []
         if predictor is None or predictor.multipliers is None:
             return
@@ -496,7 +484,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         self._blows = [struck.contact(i).resultant.force for i in range(len(self.contacts))]
 
     def _look(self) -> None:
-        self._newton_forms.inertia.ends = self._newton_forms.forces()
+        self._system.forms.inertia.ends = self._system.forms.forces()
         super()._look()
         forces = self.report.contact_forces
         for i, blow in enumerate(self._blows):
