@@ -1,7 +1,5 @@
 """Errors that every rank raises together."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """Parts of a solve that a program may bring itself, and optional ones of the package."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, fields

@@ -1,7 +1,5 @@
 """Options: one typed dataclass, its table, and what a command line says of it."""
 
-from __future__ import annotations
-
 import difflib
 import math
 import re

@@ -1,7 +1,5 @@
 """The user's door: a contact problem from forms, conditions and contacts to a solution."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Mapping, Sequence

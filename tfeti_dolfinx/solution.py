@@ -1,7 +1,5 @@
 """The solution of a problem: fields, contact data, values at points."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

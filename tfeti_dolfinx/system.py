@@ -1,7 +1,5 @@
 """The parts of a solve, made in stages that are kept until their input changes."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace

@@ -1,7 +1,5 @@
 """Checks that any implementation of a protocol passes: Block, K⁺, feasible set."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Diagnostics of a solution: the warnings of the report."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

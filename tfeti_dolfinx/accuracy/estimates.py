@@ -1,7 +1,5 @@
 """Estimates of the algebraic and the discretisation error of a solve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import nan
 from time import perf_counter

@@ -1,7 +1,5 @@
 """Checks that all ranks make the same call with the same arguments: one small message each."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import os

@@ -3,8 +3,6 @@
 Shapes and units stand in the docstrings.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The only place that knows versions of DOLFINx (0.9 to 0.11) and of PETSc."""
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

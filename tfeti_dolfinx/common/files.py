@@ -1,7 +1,5 @@
 """Names of files, and files that are whole or not there."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Times of stages, and papers of the methods for ``-citations``."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Rows of arrays that travel between ranks."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 import numpy as np

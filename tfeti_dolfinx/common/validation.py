@@ -1,7 +1,5 @@
 """Checks of what is given, and parameters that say once what they are."""
 
-from __future__ import annotations
-
 import math
 import reprlib
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Rows of contact: normals and tangents."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Statuses of contact conditions, and what a solution says of a contact or a rigid body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

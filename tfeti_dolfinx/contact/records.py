@@ -1,7 +1,5 @@
 """Conditions of contact: their tables, how integrals make them, and their forces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any

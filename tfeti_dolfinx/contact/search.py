@@ -1,7 +1,5 @@
 """The search for contact conditions of obstacles and pairs."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

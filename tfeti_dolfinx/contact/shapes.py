@@ -1,7 +1,5 @@
 """Shapes of obstacles, and checks of those that a user brings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol

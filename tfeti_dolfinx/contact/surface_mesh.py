@@ -1,7 +1,5 @@
 """Rigid shapes whose surface is a mesh: triangles in space, lines in the plane."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

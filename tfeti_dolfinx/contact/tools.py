@@ -1,7 +1,5 @@
 """The rigid bodies of a problem: where they are, and how rows of contact know them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

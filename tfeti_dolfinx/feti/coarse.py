@@ -1,7 +1,5 @@
 """The natural coarse space: G = Rᵀ Bᵀ, its projectors, and motions that no row of B resists."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """The dual problem of a scene: Blocks and rows in, a quadratic program out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """A bound of the algebraic error in energy, from the gap between primal and dual values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

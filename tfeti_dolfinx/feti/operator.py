@@ -1,7 +1,5 @@
 """The dual operators F = B K⁺ Bᵀ and its preconditioners."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

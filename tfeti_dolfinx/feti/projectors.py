@@ -1,7 +1,5 @@
 """GGᵀ, its factors and projectors, on faces too."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Recovery of displacements from multipliers: u = K⁺(f − Bᵀλ) + Rα."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

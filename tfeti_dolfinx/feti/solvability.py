@@ -1,7 +1,5 @@
 """Solvability: can contact and friction balance the load on bodies that nothing else holds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The stopping rule: the displacement of each body is right."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

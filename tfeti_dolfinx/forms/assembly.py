@@ -1,7 +1,5 @@
 """Compiled forms on the torn mesh, their matrices, and whether their data has changed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from hashlib import blake2b

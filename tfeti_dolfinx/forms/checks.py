@@ -1,7 +1,5 @@
 """Checks of forms: arguments, coefficients, measures and tags on the torn mesh."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import basix

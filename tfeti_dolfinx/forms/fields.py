@@ -1,7 +1,5 @@
 """Stress fields, nodal averages over cells and tears, and the discretisation error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

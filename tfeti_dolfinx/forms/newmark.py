@@ -7,8 +7,6 @@ With τ the step, f the mean load and w = u + τv, or what takes its place,
 It is half of what the literature has, so that λ are forces: their mean in the step.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field

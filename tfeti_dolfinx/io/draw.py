@@ -5,8 +5,6 @@ ranks. This file is run as a script and imports nothing of the package: a child 
 must not start MPI.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

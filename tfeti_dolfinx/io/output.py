@@ -1,7 +1,5 @@
 """Files for ParaView: VTX where DOLFINx has ADIOS2, XDMF, PVD; they appear whole."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import os

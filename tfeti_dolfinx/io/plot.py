@@ -1,7 +1,5 @@
 """Pictures without a screen; only here, and in the process that draws, is a plotting library."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Recursive coordinate bisection of points that ranks share, along layers of cells."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

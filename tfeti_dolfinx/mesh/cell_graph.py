@@ -1,7 +1,5 @@
 """Cells of an untorn mesh that share facets or vertices, on any ranks; their connected pieces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The torn mesh with its subdomains, bodies and tags."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Unknowns of the torn mesh: spaces, copies of nodes, their groups."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Any
 

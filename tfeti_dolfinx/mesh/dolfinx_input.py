@@ -1,7 +1,5 @@
 """Decomposition of a mesh that was made in DOLFINx."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """Physical groups, partitions and names of a gmsh model."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Read gmsh files: cells, partitions and tags, split among ranks."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Parts of a mesh: by a partitioner or as given, each connected."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

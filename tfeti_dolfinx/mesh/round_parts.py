@@ -1,7 +1,5 @@
 """Round parts of a distributed mesh: balanced k-means, then smooth interfaces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

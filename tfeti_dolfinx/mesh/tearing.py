@@ -1,7 +1,5 @@
 """Tear a mesh along its subdomains, which ranks share by numbers of cells."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from weakref import WeakSet

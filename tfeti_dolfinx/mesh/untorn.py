@@ -1,7 +1,5 @@
 """Meshes before they are torn: cells, their facets and edges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tolerances of the search for contact and of its integrals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from tfeti_dolfinx.common.arrays import EPSILON

@@ -1,7 +1,5 @@
 """J2 plasticity in finite strain: logarithmic strains, a return that is that of small strain."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Forms of Newton's method: its matrix and load, on the mesh as it was or as it is."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar

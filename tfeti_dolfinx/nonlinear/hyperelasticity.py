@@ -1,7 +1,5 @@
 """Hyperelastic materials in finite strain."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from math import pi
 from typing import Any

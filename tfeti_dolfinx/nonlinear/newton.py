@@ -1,7 +1,5 @@
 """Newton's method with the contact inside: tolerances, how long a model is kept, acceleration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Nonlinear bodies in contact by Newton's method, each step a contact problem of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Internal variables of materials: functions that get new values at the end of a load step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """Newton's method on Coulomb's law itself, by generalised conjugate residuals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

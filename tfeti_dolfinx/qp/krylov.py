@@ -1,7 +1,5 @@
 """PCPG: preconditioned conjugate projected gradients, with its directions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

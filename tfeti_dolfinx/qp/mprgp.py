@@ -1,7 +1,5 @@
 """MPRGP and MPGP: gradient projection with proportioning and reduced steps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Recycling of search directions, with their products with F, from earlier solves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """SMALSE-M: semimonotonic augmented Lagrangians around MPRGP."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """All solvers of the dual problem in one table."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

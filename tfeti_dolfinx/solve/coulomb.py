@@ -1,7 +1,5 @@
 """Coulomb's law: Newton's method on it, and problems with given bounds of friction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

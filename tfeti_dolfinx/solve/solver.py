@@ -1,7 +1,5 @@
 """The solver that the options choose."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

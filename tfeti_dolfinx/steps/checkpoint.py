@@ -1,7 +1,5 @@
 """Checkpoints of a series of load steps: files of each rank, and one that says which count."""
 
-from __future__ import annotations
-
 import fcntl
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Cholesky factors of sparse matrices by PETSc, and the options that they read."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

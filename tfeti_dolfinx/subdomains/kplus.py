@@ -1,7 +1,5 @@
 """The generalised inverse K⁺ of a subdomain, and why a stiffness has none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol

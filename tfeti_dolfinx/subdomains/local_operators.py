@@ -1,7 +1,5 @@
 """K⁺, K_bb and S of all subdomains of a rank, in the form that costs least."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """All Blocks of a rank as one, made from the forms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
