@@ -112,11 +112,9 @@ class SolverCounts:
         """Return the counts of a solver's run."""
         preconditioner, inner, steps = dual.preconditioner, dual.deflation, result.steps
         return cls(
-            F_multiplications=dual.F.count["solver"],
-            preconditioner_multiplications=(
-                0 if preconditioner is None else preconditioner.count["solver"]
-            ),
-            power_method_multiplications=dual.F.count["power method"],
+            F_multiplications=dual.F.count,
+            preconditioner_multiplications=(0 if preconditioner is None else preconditioner.count),
+            power_method_multiplications=dual.norm_count,
             recoveries=accuracy.looks,
             friction_iterations=settling.iterations,
             friction_newton_steps=settling.newton_steps,

@@ -12,7 +12,6 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.constraints.contact_state import (
     ContactData,
     ContactStatus,
@@ -383,14 +382,10 @@ class Solution:
         Raises:
             InputError: There is no such body.
         """
-        names = [tool.name for tool in self.tool_motions]
         with agreeing(self.dofs.comm, "tool") as given:
-            if which in names:
-                which = names.index(str(which))
-            if not is_whole(which) or not 0 <= which < len(names):
-                raise InputError(f"tool {shown(which)}: expected one of {names}, or its position")
-            given["tool"] = which
-        tool, records = self.tool_motions[which], self.gluing.records
+            names = [tool.name for tool in self.tool_motions]
+            position = given["tool"] = position_of(names, which, "tool")
+        tool, records = self.tool_motions[position], self.gluing.records
         gdim, own = len(tool.centre), np.isin(records.contact, tool.contacts)
         arm = np.zeros((int(np.sum(own)), 3))
         arm[:, :gdim] = records.place[own] - tool.centre

@@ -146,16 +146,16 @@ class ContactPartner(ABC):
 # --- Lists of contacts ------------------------------------------------------------------------
 
 
-def position_of(names: Sequence[str], which: int | str) -> int:
-    """Return the position of a contact, given that or its name; raise an InputError else."""
+def position_of(names: Sequence[str], which: int | str, what: str = "contact") -> int:
+    """Return the position of a contact or tool, given it or its name; raise an InputError else."""
     if is_whole(which) and 0 <= which < len(names):
         return int(which)
     if isinstance(which, str) and names.count(which) == 1:
         return names.index(which)
     known = ", ".join(f"{i}: {name}" for i, name in enumerate(names)) or "none"
     raise InputError(
-        f"contact {shown(which)}: expected a position or a name that only one of them has, of "
-        f"{known}; name= of Contact and Obstacle gives names"
+        f"{what} {shown(which)}: expected a position or a name that only one of them has, of "
+        f"{known}; name= gives names"
     )
 
 

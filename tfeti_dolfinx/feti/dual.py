@@ -176,7 +176,7 @@ class Dual:
             self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
         self.contact_rows = constraints.contact_rows
         self.law, self.feasible = feasible, feasible(constraints)
-        self._norms = dict[int, float]()  # of so many Lanczos steps
+        self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
         self.begin: Array | float = 0.0
         self.recycled: Recycled | None = None
@@ -272,8 +272,8 @@ class Dual:
         """Count multiplications from 0 on."""
         for operator in (self.F, self.preconditioner):
             if operator is not None:
-                operator.count.clear()
-        self.coarse.factors.count = 0
+                operator.count = 0
+        self.coarse.factors.count = self.norm_count = 0
         if self.deflation is not None:
             self.deflation.factors.count = 0
 
@@ -284,8 +284,9 @@ class Dual:
         """
         self.feasible = self.law(self.constraints)  # c may be another, and what the law refers to
         if norm_steps and norm_steps not in self._norms:
-            with self.F.charged_to("power method"):
-                self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)
+            before = self.F.count
+            self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)
+            self.norm_count, self.F.count = self.F.count - before, before
         norm = self._norms.get(norm_steps, 1.0)
         on = self._preconditioner_on if self.preconditioner is not None else None
         return QP(

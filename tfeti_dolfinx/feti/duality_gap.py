@@ -1,7 +1,5 @@
 """A bound of the algebraic error in energy, from the gap between primal and dual values."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
@@ -13,19 +11,13 @@ from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import FeasibleSet
 
 
-@dataclass(frozen=True)
-class EnergyBound:
-    """A bound of ‖u − u*‖_K, u* the exact solution of the discrete problem; on all ranks."""
-
-    error: float  # the bound, a root of an energy; infinite where no forces balance the load
-    gap: float  # J(v) − q(λ) ≥ 0 of an admissible displacement v and of balanced forces λ
-    moved: float  # ‖u − u_λ‖_K, what it takes to balance the forces; 0 where they are
-
-
 def energy_bound(
     dual: Dual, lam: Array, u: Array, norm: float, balanced: float = 1e-12
-) -> EnergyBound:
-    """Bound the algebraic error of the displacement u of λ ∈ Ω. Collective.
+) -> tuple[float, float]:
+    """Bound ‖u − u*‖_K of the displacement u of λ ∈ Ω, u* the discrete solution. Collective.
+
+    Return the bound, infinite where no forces balance the load, and ‖u − u_λ‖_K, what it takes to
+    balance them, 0 where they are.
 
     With K u = f − Bᵀλ, λ ∈ Ω, and any admissible v
 
@@ -40,7 +32,7 @@ def energy_bound(
     """
     forces, displacement, apart = _balanced(dual, lam, u, norm, balanced)
     if not np.isfinite(apart):
-        return EnergyBound(apart, apart, apart)
+        return apart, apart
     change, loss = admissible(dual, forces, displacement, norm)
     lifted = np.empty_like(change)
     dual.lifting.mult(change, lifted)
@@ -49,7 +41,7 @@ def energy_bound(
     moved, stretched, lost = summed(comm, own)
     energy = 0.5 * (np.sqrt(max(moved, 0.0)) + np.sqrt(stretched)) ** 2
     gap = bcast_from_root(comm, float(max(energy + lost, 0.0)))
-    return EnergyBound(apart + float(np.sqrt(2.0 * gap)), gap, apart)
+    return apart + float(np.sqrt(2.0 * gap)), apart
 
 
 def admissible(

@@ -1,8 +1,6 @@
 """The dual operators F = B K⁺ Bᵀ and its preconditioners."""
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
@@ -93,30 +91,20 @@ class DualOperator:
             diag(A_s); None: they stay as they are.
 
     Attributes:
-        count: Multiplications so far, by who they are charged to (``"solver"`` by default).
+        count: Multiplications since somebody has set it to 0.
         seconds: Seconds that diag(A_s) has taken on this rank, in ``times`` multiplications.
     """
 
     def __init__(self, B: PETSc.Mat, local: LocalOperator, metric: Metric | None = None) -> None:
         self.B, self.local, self.metric = B, local, metric
-        self.count: Counter[str] = Counter()
+        self.count, self.seconds, self.times = 0, 0.0, 0
         self.added: Array | float = 0.0  # of rows of springs
-        self._payer, self.seconds, self.times = "solver", 0.0, 0
         self._w, self._x = B.createVecs()
         self._v = self._w.duplicate()
         with raised_on_all_ranks(self._w.getComm().tompi4py()):
             local.prepare()
             if metric is not None:
                 metric.trace.prepare()
-
-    @contextmanager
-    def charged_to(self, payer: str) -> Iterator[None]:
-        """Charge multiplications inside the block to someone else."""
-        self._payer, previous = payer, self._payer
-        try:
-            yield
-        finally:
-            self._payer = previous
 
     def __call__(self, x: Array) -> Array:
         """B diag(A_s) Bᵀ x, from this rank's part of x to that of the product. Collective."""
@@ -128,7 +116,7 @@ class DualOperator:
 
     def multiply(self, w: Array, out: Array) -> None:
         """out = diag(A_s) w on this rank's trace, which counts as a multiplication."""
-        self.count[self._payer] += 1
+        self.count += 1
         start = perf_counter()
         self.local.mult(w, out)
         self.seconds, self.times = self.seconds + perf_counter() - start, self.times + 1

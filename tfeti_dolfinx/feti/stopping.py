@@ -9,7 +9,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
+from tfeti_dolfinx.feti.duality_gap import energy_bound, within
 from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, QPResult, StoppingRule
@@ -166,7 +166,8 @@ def measure(
 class TargetStatus:
     """Algebraic error of an iterate beside its target; the same on all ranks."""
 
-    bound: EnergyBound  # bound of its algebraic error
+    bound: float  # bound of its algebraic error
+    moved: float  # distance in energy to the displacement of forces that balance the load
     goal: float  # the other error
     energy: float  # ‖u‖_K
     allowed: float  # largest bound of the algebraic error that meets the target
@@ -279,11 +280,11 @@ class Accuracy(StoppingRule):
         self.allowed = self._tolerances()
         self.looks, self.waits = self.looks + 1, False
         if self.goal is not None:
-            bound = energy_bound(self._dual, state.lam, state.u, self.norm)
+            error = energy_bound(self._dual, state.lam, state.u, self.norm)
             goal = self.goal(state.u)
             allowed = self._limits.target * max(goal, 1e-5 * now.energy)
             allowed = max(allowed, self.allowed.rounding)
-            self.reached.append(TargetStatus(bound, goal, now.energy, allowed))
+            self.reached.append(TargetStatus(*error, goal, now.energy, allowed))
 
     def look_again(self, face: Face) -> bool:
         """Measure the iterate of the last look with another set of multipliers. Collective.
@@ -375,7 +376,7 @@ class Accuracy(StoppingRule):
         """Return the bound at the last look over what the goal allows; 0 without a goal."""
         if not self.reached:
             return 0.0
-        return self.reached[-1].bound.error / max(self.reached[-1].allowed, TINY)
+        return self.reached[-1].bound / max(self.reached[-1].allowed, TINY)
 
 
 # from the dual problem, rtol, atol, b₀ with what rounding leaves of it, and ‖F‖ to a stopping rule

@@ -117,7 +117,7 @@ def solve_dual(
             "bears it, or a Dirichlet condition or a spring besides"
         )
     if monitor is None and options.monitor:
-        monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count["solver"])
+        monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
     rtol = options.number if rtol is None else rtol
     scale = homogenised.reference, homogenised.rounding
     rule = make_rule(dual, rtol, options.atol, scale, qp.norm)

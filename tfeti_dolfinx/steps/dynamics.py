@@ -181,7 +181,7 @@ class Predictor:
         result, accuracy = solve_dual(dual, options, options.qp_type, start)
         self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
         self.multipliers = Multipliers(result.lam.copy(), result.face)
-        self.multiplications = dual.F.count["solver"]
+        self.multiplications = dual.F.count
         conclude(result, accuracy, options, self._dofs.comm)
         return accuracy.u
 
