@@ -176,18 +176,10 @@ class Options:
 
 # what factors of subdomains, the coarse problem and contact rows read from PETSc's options
 FACTOR_OPTION = re.compile(r"(sub|coarse|face)_((?:pc_factor|mat)_\w+)")
-# some of them, for a hint
-FACTOR_NAMES = (
-    "pc_factor_mat_solver_type",
-    "pc_factor_mat_ordering_type",
-    "pc_factor_fill",
-    "pc_factor_shift_type",
-    "pc_factor_shift_amount",
-    "pc_factor_zeropivot",
-    "mat_cholmod_factor",
-    "mat_cholmod_print",
-    "mat_mumps_icntl_14",
-    "mat_mumps_cntl_1",
+# what is expected where another is given
+OF_FACTORS = (
+    "expected -{0}pc_factor_mat_solver_type, which chooses the package that makes them, or another "
+    "-{0}pc_factor_... or -{0}mat_... that it reads; PETSc's -help lists them"
 )
 # words of switches
 YES, NO = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
@@ -237,12 +229,8 @@ def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
             f"{choices}"
         )
     if family := re.match(r"(sub|coarse|face)_", name):
-        if name == f"{family[0]}pc_type":
-            return (
-                "factors are always Cholesky's; "
-                f"expected -{prefix}{family[0]}pc_factor_mat_solver_type, which chooses the package"
-            )
-        return _near_factor_names(name.removeprefix(family[0]), f"{prefix}{family[0]}")
+        own = f"{prefix}{family[0]}"
+        return f"factors are always Cholesky's; {OF_FACTORS.format(own)}"
     low = name.lower()
     near = [o for o in known if o == low or low.endswith(f"_{o}") or o.startswith(f"{low}_")]
     alike = difflib.get_close_matches(low, known, cutoff=0.72)  # not those alike in _type alone
@@ -269,19 +257,11 @@ def _check_factors_read(named: Mapping[str, Any], prefix: str) -> None:
         unread = [unread_options(given, solver) for solver in dict.fromkeys(solvers)]
         for name in (name for name in given if all(name in names for names in unread)):
             own, package = f"{prefix}{family}_", re.match(r"mat_(cholmod|mumps)_", name)
-            hint = _near_factor_names(name, own)
+            hint = OF_FACTORS.format(own)
             if package and package[1] not in solvers:
                 hint = f"expected -{own}pc_factor_mat_solver_type {package[1]} with it"
             makers = " or ".join(solvers)
             raise InputError(f"-{own}{name}: factors by {makers} read no such option; {hint}")
-
-
-def _near_factor_names(name: str, prefix: str) -> str:
-    """Say what option of factors may be meant."""
-    near = difflib.get_close_matches(name, [n for n in FACTOR_NAMES if n != name])
-    if near:
-        return f"expected {_listed(near, prefix, ' or ')} perhaps"
-    return f"expected -{prefix}pc_factor_... or -{prefix}mat_..., which PETSc's -help lists"
 
 
 def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
