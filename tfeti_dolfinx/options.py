@@ -31,8 +31,6 @@ from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options
 from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
 
-# --- Options ----------------------------------------------------------------------------------
-
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2
 

@@ -43,8 +43,6 @@ from tfeti_dolfinx.subdomains.subdomains import (
 # a tangent of Newton's method serves this part of the multiplications of a stiffness that stays
 OF_TANGENT = 5
 
-# --- Settings of a solve ---------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class Settings:

@@ -24,8 +24,6 @@ from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock, stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Quality of cells -------------------------------------------------------------------------
-
 
 def flatness(mesh: dmesh.Mesh) -> Array:
     """‖J‖‖J⁻¹‖/gdim of each local cell, in Frobenius norms: 1 for a reference cell, shape ``(c,)``.
@@ -49,9 +47,6 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     volume = np.abs((J[0] * adjugate[0]).sum(axis=0))
     sizes = np.sqrt((J**2).sum(axis=(0, 1)) * (adjugate**2).sum(axis=(0, 1)))
     return np.asarray(sizes / np.maximum(gdim * volume, TINY * sizes))
-
-
-# --- Nodes that bodies share without a common facet -------------------------------------------
 
 
 def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:

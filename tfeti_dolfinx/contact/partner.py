@@ -37,8 +37,6 @@ from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_c
 from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
-# --- What obstacles and pairs have in common --------------------------------------------------
-
 Gap: TypeAlias = str | float | Callable[[Array], ArrayLike]
 # what the geometry has for a gap: the distance of facets, or of the smooth surfaces through them
 GEOMETRY, CURVED = "geometry", "curved"

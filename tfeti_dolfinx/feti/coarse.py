@@ -7,7 +7,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array, vstack
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, joined
 from tfeti_dolfinx.common.parallel import (
     any_rank,
     bcast_from_root,
@@ -157,7 +157,9 @@ class CoarseSpace(Coarse):
 
         √(D/σ) Pᵀu − λ/σ, in the length that makes a spring as stiff as a row.
         """
-        stretched = self.subdomains.spring_motions(u) / np.sqrt(self.sigma)
+        parts = [(b.springs, u[part]) for b, part in self.subdomains.block_parts]
+        stretches = [np.sqrt(of.stiffness) * (of.stretches.T @ v) for of, v in parts if of]
+        stretched = joined(stretches) / np.sqrt(self.sigma)
         return np.asarray(stretched - lam[self.springs] / self.sigma)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:

@@ -16,8 +16,6 @@ from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- K on the trace and next to it ------------------------------------------------------------
-
 
 def near_stiffness(blocks: Sequence[SparseBlock], rigid: int = 0) -> tuple[csr_array, Array]:
     """K between the trace unknowns of each subdomain and those that share a cell with them.

@@ -22,8 +22,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_facets, facet_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
-# --- Lagrange elements on facets --------------------------------------------------------------
-
 create_element = cache(basix.create_element)  # each is made once
 # vertices of a facet in the order of its polygon; DOLFINx numbers quadrilaterals as tensors
 POLYGON = {"interval": [0, 1], "triangle": [0, 1, 2], "quadrilateral": [0, 1, 3, 2]}

@@ -23,8 +23,6 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.recycling import Along, DirectionStore
 
-# --- Estimate of ‖PFP‖ ------------------------------------------------------------------------
-
 # an off-diagonal entry this small in units of the norm ends the method: the space is exhausted
 EXHAUSTED = 1e-12
 

@@ -172,9 +172,6 @@ def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, 
     return words
 
 
-# --- Bounds of friction -----------------------------------------------------------------------
-
-
 class FrictionBounds:
     """The λ_N that friction limits are taken from. All methods are collective.
 
@@ -318,9 +315,6 @@ class FrictionBounds:
         squares = sums(self._constraints.forces(forces) ** 2, subdomains.trace_parts)
         squares = subdomains.of_bodies([squares])[0]
         return steering(self._comm, *np.sqrt(squares))
-
-
-# --- Newton's method on the law ---------------------------------------------------------------
 
 
 class NewtonOnLaw:

@@ -36,8 +36,6 @@ from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, subdomain_data
 from tfeti_dolfinx.system import Settings
 
-# --- Energies and work of a step --------------------------------------------------------------
-
 NAMES = ("load", "contact", "friction", "supports", "predictor")
 
 
@@ -79,9 +77,6 @@ def balance(
         **dict(zip(NAMES, work, strict=True)),
         "defect": kinetic + elastic - before - sum(work),
     }
-
-
-# --- Predictor: projection in M onto admissible displacements ---------------------------------
 
 
 class Predictor:

@@ -14,8 +14,6 @@ from scipy.linalg import expm
 from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix
 from tfeti_dolfinx.errors import InputError
 
-# --- Input of Blocks --------------------------------------------------------------------------
-
 
 @dataclass(frozen=True)
 class SubdomainData:

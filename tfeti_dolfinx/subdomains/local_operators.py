@@ -13,8 +13,6 @@ from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock, Stiffness
 
-# --- Choice of their form ----------------------------------------------------------------------
-
 LOCAL_TYPES = ("auto", "implicit", "explicit", "shared")
 
 

@@ -150,11 +150,6 @@ class Subdomains:
         shape = sum(map(len, parts)), sum(part.shape[1] for part in parts)
         return _assembled(parts, self.spring_parts, self.kernel_parts, shape)
 
-    def spring_motions(self, u: Array) -> Array:
-        """√D Pᵀu of the springs, shape ``(k,)``, for u of shape ``(n,)``."""
-        found = [(own, u[part]) for b, part in self.block_parts if (own := b.springs) is not None]
-        return joined([np.sqrt(own.stiffness) * (own.stretches.T @ v) for own, v in found])
-
     @property
     def kernel_load(self) -> Array:
         """Rᵀ f, shape ``(r,)``; 0 where it is rounding of f, as of stresses that are given."""
