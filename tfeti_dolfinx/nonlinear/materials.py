@@ -263,11 +263,9 @@ class J2Plasticity(Plasticity):
         self.p = fem.Function(Q, name="accumulated_plastic_strain")
         self._dp = fem.Function(Q, name="plastic_increment")  # of this load step
         self._slope = fem.Function(Q, name="hardening_slope")
-        self._q, self._G = fem.Function(Q), fem.Function(Q)
-        points = interpolation_points(Q)
-        s = self._trial(u)
-        self._q_of_u = fem.Expression(ufl.sqrt(1.5 * ufl.inner(s, s)), points)
-        self._G_of_x = fem.Expression(elasticity.mu, points)
+        self._q_and_G, s = fem.Function(self._at.space((2,))), self._trial(u)
+        q_and_G = ufl.as_vector((ufl.sqrt(1.5 * ufl.inner(s, s)), elasticity.mu))
+        self._q_and_G_of_u = fem.Expression(q_and_G, interpolation_points(Q))
         self._n = 1.5 * s / self._norm(u)  # direction of plastic flow
         new = self._tensor(self.plastic_strain) + self._dp * self._n
         places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
@@ -277,14 +275,13 @@ class J2Plasticity(Plasticity):
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""
-        self._q.interpolate(self._q_of_u)
-        self._G.interpolate(self._G_of_x)
-        q = self._q.x.array
+        self._q_and_G.interpolate(self._q_and_G_of_u)
+        q, G = self._q_and_G.x.array.reshape(-1, 2).T.copy()
         hardening = self.hardening()
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
             if not np.all(np.isfinite(q)):
                 raise InputError("J2Plasticity: the stress is not finite")
-            dp, slope = hardening.returned(q, self._G.x.array, self.p.x.array)
+            dp, slope = hardening.returned(q, G, self.p.x.array)
         self._dp.x.array[:] = dp
         self._slope.x.array[:] = slope
 
