@@ -5,6 +5,7 @@ import pytest
 from scenes import curved_obstacle, decomposed, displacement, largest, problem
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.subdomains.block import Springs
 
 SUBDOMAINS = 8
 
@@ -59,6 +60,13 @@ def displaced(p):
     u = p.solution.u.copy()
     p.destroy()
     return u
+
+
+def test_springs_are_soft_in_the_mean():
+    """Those of a ring differ: without its softest ones alone a subdomain does not float."""
+    stiffnesses = (np.diag([0.1, stiff, 1.0]) for stiff in (1.0, 10.0))
+    found = [Springs.of(np.eye(3)[:, :2], K.__matmul__, 1.0) for K in stiffnesses]
+    assert [springs is None for springs in found] == [False, True]
 
 
 def test_they_do_not_change_the_answer():

@@ -174,11 +174,11 @@ class Springs:
 
     @classmethod
     def of(cls, U: Array, multiply: Callable[[Array], Array], soft: float) -> Springs | None:
-        """Return them, from a basis U of motions outside and K B; None where all D ≥ ``soft``."""
+        """Return them, from a basis U of motions outside and K B; None at a mean D ≥ ``soft``."""
         if not U.shape[1]:
             return None
         D, V = np.linalg.eigh(U.T @ multiply(U))
-        if not 0.0 < D[0] < soft:
+        if not (D[0] > 0.0 and D.mean() < soft):
             return None
         W = U @ V
         KW = multiply(W)
