@@ -93,6 +93,7 @@ class ContactProblem:
     """
 
     form_name: ClassVar[str] = "a"
+    _system: System[Forms]
     # input whose functions are not those of the solution
     _unknown_before: ClassVar[tuple[str, ...]] = ()
 

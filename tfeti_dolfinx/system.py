@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from dolfinx import fem
@@ -162,6 +162,8 @@ class Settings:
 # --- The stages of a solve --------------------------------------------------------------------
 
 T = TypeVar("T")
+# of nonlinear bodies, or in time, they have more
+OwnForms = TypeVar("OwnForms", bound=Forms, covariant=True)
 
 
 def made(item: T | None) -> T:
@@ -171,7 +173,7 @@ def made(item: T | None) -> T:
     return item
 
 
-class System:
+class System(Generic[OwnForms]):
     """Parts of a scene's dual problem. Creation and all methods are collective.
 
     ``STAGES`` below are made in their order, where something they depend on has changed.
@@ -192,15 +194,14 @@ class System:
 
     def __init__(
         self,
-        forms: Forms,
+        forms: OwnForms,
         bcs: Sequence[fem.DirichletBC],
         contacts: list[ContactPartner],
         dofs: TornDofs,
         settings: Settings,
         method: SubdomainMethod | None = None,
     ) -> None:
-        self.forms: Any = forms  # those of nonlinear bodies, or in time, have more
-        self.bcs, self._contacts = bcs, contacts
+        self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._settings = dofs, settings
         self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)
@@ -531,7 +532,7 @@ class System:
 
 
 # in the order in which they are made, with the name that their seconds have in the report
-STAGES: dict[str, tuple[str, Callable[[System], None]]] = {
+STAGES: dict[str, tuple[str, Callable[[System[Forms]], None]]] = {
     "stiffness": ("assembly", System._assemble_stiffness),
     "search": ("contact", System._find_contacts),
     "constraints": ("constraints", System._make_rows),

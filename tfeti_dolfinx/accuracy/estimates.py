@@ -59,7 +59,7 @@ class Estimates:
         )
 
 
-def estimate(system: System, solution: Solution, rounding: float) -> Estimates:
+def estimate(system: System[Any], solution: Solution, rounding: float) -> Estimates:
     """Estimate the errors of the last solution, ‖u‖_K of which may be rounding. Collective."""
     if solution.gluing.constraints is not system.gluing.constraints:
         raise InputError(

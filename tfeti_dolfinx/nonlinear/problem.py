@@ -30,6 +30,7 @@ from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue, check_sta
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
 from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.system import System
 
 
 class NonlinearContactProblem(ContactProblem):
@@ -83,6 +84,7 @@ class NonlinearContactProblem(ContactProblem):
     """
 
     form_name: ClassVar[str] = "J"
+    _system: System[NewtonForms]
     _unknown_before: ClassVar[tuple[str, ...]] = NewtonForms.names
 
     def __init__(

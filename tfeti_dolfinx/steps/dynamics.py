@@ -34,7 +34,7 @@ from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, subdomain_data
-from tfeti_dolfinx.system import Settings
+from tfeti_dolfinx.system import Settings, System
 
 NAMES = ("load", "contact", "friction", "supports", "predictor")
 
@@ -231,6 +231,8 @@ class ContactDynamics(ContactProblem):
         InputError: What is given does not fit; the message names it.
     """
 
+    _system: System[InertialForms | InertialNewtonForms]
+
     def __init__(
         self,
         a: ufl.Form,
@@ -422,6 +424,8 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
     Raises:
         InputError: What is given does not fit; the message names it.
     """
+
+    _system: System[InertialNewtonForms]
 
     def __init__(
         self,
