@@ -64,7 +64,7 @@ def displaced(p):
 
 def test_springs_are_soft_in_the_mean():
     """Those of a ring differ: without its softest ones alone a subdomain does not float."""
-    stiffnesses = (np.diag([0.1, stiff, 1.0]) for stiff in (1.0, 10.0))
+    stiffnesses = (np.diag([0.1, stiff, 1.0]) for stiff in (1.0, 20.0))
     found = [Springs.of(np.eye(3)[:, :2], K.__matmul__, 1.0) for K in stiffnesses]
     assert [springs is None for springs in found] == [False, True]
 

@@ -174,11 +174,14 @@ class Springs:
 
     @classmethod
     def of(cls, U: Array, multiply: Callable[[Array], Array], soft: float) -> Springs | None:
-        """Return them, from a basis U of motions outside and K B; None at a mean D ≥ ``soft``."""
+        """Return them, from a basis U of motions outside and K B; None unless they are soft.
+
+        ``soft`` is what the geometric mean of D is below then.
+        """
         if not U.shape[1]:
             return None
         D, V = np.linalg.eigh(U.T @ multiply(U))
-        if not (D[0] > 0.0 and D.mean() < soft):
+        if not (D[0] > 0.0 and np.exp(np.log(D).mean()) < soft):
             return None
         W = U @ V
         KW = multiply(W)
