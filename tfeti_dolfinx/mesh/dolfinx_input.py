@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from dolfinx import mesh as dmesh
@@ -27,8 +27,17 @@ CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 Marker = Callable[[Array], Array]
 
 
+class GmshData(Protocol):
+    """Mesh with its tags and their names, as DOLFINx 0.10's ``dolfinx.io.gmsh`` returns it."""
+
+    mesh: dmesh.Mesh
+    cell_tags: dmesh.MeshTags | None
+    facet_tags: dmesh.MeshTags | None
+    physical_groups: Mapping[str, tuple[int, int]]
+
+
 def decompose(
-    mesh: dmesh.Mesh | Any,
+    mesh: dmesh.Mesh | GmshData,
     subdomains: Subdomains | None = None,
     cell_tags: dmesh.MeshTags | None = None,
     facet_tags: dmesh.MeshTags | None = None,
