@@ -230,9 +230,9 @@ def points(element: FacetElement, x: Array, xi: Array) -> Array:
     return np.einsum("mv,mvd->md", element.values(xi), x[:, : element.size])
 
 
-def radii(kind: FacetKind, x: Array, xi: Array) -> Array:
-    """Radius x[0] at reference coordinates in axisymmetric models, else 1, shape ``(m,)``."""
-    return points(kind.geometry, x, xi)[:, 0] if kind.axisymmetric else np.ones(len(xi))
+def radii(kind: FacetKind, facets: Facets, facet: Array, xi: Array) -> Array | float:
+    """Radius x[0] at reference coordinates of facets in axisymmetric models, ``(m,)``, else 1."""
+    return points(kind.geometry, facets.x[facet], xi)[:, 0] if kind.axisymmetric else 1.0
 
 
 def densities(element: FacetElement, x: Array, xi: Array) -> Array:
@@ -277,7 +277,7 @@ def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, A
     slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), nodes)
     weight = _areas(slopes.reshape(n * q, *slopes.shape[2:])) * np.tile(w, n)
     facet, xi = np.repeat(np.arange(n), q), np.tile(xi, (n, 1))
-    return facet, xi, weight * radii(kind, facets.x[facet], xi)
+    return facet, xi, weight * radii(kind, facets, facet, xi)
 
 
 def hat_areas(kind: FacetKind, facets: Facets) -> Array:

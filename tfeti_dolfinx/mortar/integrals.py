@@ -207,7 +207,7 @@ def facet_multipliers(
     hats = kind.hats.values(xi)
     covered = sum_rows(place, weight[:, None] * hats, len(facets))
     mass = sum_rows(place, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
-    area = of.area[facets] * radii(kind, of.x[facets], np.full((len(facets), xi.shape[1]), 0.5))
+    area = of.area[facets] * radii(kind, of, facets, np.full((len(facets), xi.shape[1]), 0.5))
     hardly = covered.sum(axis=1) <= SEARCH.hardly_covered * area
     mass[hardly] = np.eye(kind.hats.size)
     covered[hardly] = 0.0
@@ -236,7 +236,7 @@ def integrate(
         meet = np.ones(len(secondary), dtype=bool)
         meet[corners.secondary[np.minimum(*hats) < 1.0 - SEARCH.held]] = False
         near[meet] = False
-    weight = segments.weight * radii(kind, secondary.x[at.secondary], at.xi)
+    weight = segments.weight * radii(kind, secondary, at.secondary, at.xi)
     dual = facet_multipliers(kind, secondary, at.secondary, at.xi, weight, near)
     if np.any(secondary.held) and np.any(primary.held):
         corner, *held = _held(kind, (secondary, primary), corners, dual.facet)
