@@ -20,8 +20,9 @@ def thrown_velocity(gdim, x, above, speed, along, spin):
 class Thrown:
     """A unit box, E = ρ = 1, with a velocity that is not rigid, above a plane, or a box on it.
 
-    ``thrown``: speed downwards, along, and of a part that turns and shears. Keywords are those of
-    ``ContactDynamics``; others are options.
+    ``thrown``: speed downwards, along, and of a part that turns and shears. ``begin``: displacement
+    along at the start; the plane has the opposite one. Keywords are those of ``ContactDynamics``;
+    others are options.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class Thrown:
         nu=0.3,
         weight=0.0,
         thrown=(0.3, 0.1, 0.05),
+        begin=0.0,
         subdomains=4,
         **keywords,
     ):
@@ -46,7 +48,10 @@ class Thrown:
             lambda x: thrown_velocity(gdim, x, gap / 2 if below else -1.0, *thrown)
         )
         low, up = (-1.0 if below else -gap), np.eye(gdim)[-1]
+        at = fem.Function(V)
+        at.x.array[::gdim] = begin
         plane = tfeti.Plane(low * up, up)
+        plane = tfeti.RigidBody(plane, displacement=(-begin, 0.0)) if begin else plane
         bottom = "lower bottom" if below else "bottom"
         contacts = [tfeti.Obstacle(bottom, plane, friction=friction, reach=1.0, name="plane")]
         if below:
@@ -59,6 +64,7 @@ class Thrown:
             contacts,
             d,
             velocity=velocity,
+            u=at,
             petsc_options={"rtol": 1e-10, **keywords},
             **{"mass": 1.0, **own},
         )

@@ -266,6 +266,11 @@ class ContactDynamics(ContactProblem):
         check_copies(self.u.x.array, self.dofs, "u, the displacement at the start,")
         check_copies(v, self.dofs, "velocity")
         self._system.forms.inertia.move(np.array(self.u.x.array), np.array(v))
+        # slips of the first step count from where bodies and tools are now
+        self._system.begin_at(self.dofs.to_primal(self.u.x.array))
+        tools = self._system.tools
+        tools.read(self.time)
+        tools.begin = [tools.pose(i) for i in range(len(tools))]
         self._predictor: Predictor | None = None
         if self._stabilised:
             self._predictor = Predictor(self.dofs, self._settings)
@@ -455,7 +460,9 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         return InertialNewtonForms(*given, u=self.u, finite=self._finite)
 
     def _find(self) -> None:
-        if self._places is not None:
+        last = np.array(self.u.x.array)
+        if self._places is not None:  # the prediction is that of the begin of the step
+            self._set(self._begin)
             self._go_to_places(self._places)
         try:
             self._system.look_for_changes()
@@ -465,6 +472,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         finally:
             if self._places is not None:
                 self._places.back()
+            self.u.x.array[:] = last
         super()._find()
 
     def _project_velocity(self) -> None:
