@@ -11,7 +11,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.bem.inside import BoundarySolution
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import JIT_OPTIONS, geometry_dofmap, interpolation_points
+from tfeti_dolfinx.common.compat import geometry_dofmap, interpolation_points
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
@@ -117,9 +117,7 @@ class _Midpoints:
         self._u = fem.Function(u.function_space)
         W = fem.functionspace(u.function_space.mesh, ("DG", 0, (3, 3)))
         self._values = fem.Function(W)
-        self._expression = fem.Expression(
-            ufl.replace(sigma, {u: self._u}), interpolation_points(W), jit_options=JIT_OPTIONS
-        )
+        self._expression = fem.Expression(ufl.replace(sigma, {u: self._u}), interpolation_points(W))
 
     def of(self, values: Array) -> Array:
         """Return an array of shape ``(cells, 3, 3)``, for values of u in DOLFINx's order."""

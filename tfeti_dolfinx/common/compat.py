@@ -18,8 +18,6 @@ except ImportError:
     from dolfinx.io import gmshio as _gmshio
 
 
-# a compile by another rank or run may take longer than DOLFINx's 10 seconds
-JIT_OPTIONS = {"timeout": 300}
 # graph partitioners that this DOLFINx was built with
 GRAPH_PARTITIONERS = [
     name for name in ("scotch", "parmetis", "kahip") if hasattr(graph, f"partitioner_{name}")

@@ -11,7 +11,7 @@ from dolfinx import fem, la
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import JIT_OPTIONS, assemble_csr
+from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import raised_on_all_ranks
@@ -80,7 +80,7 @@ class Forms:
             checked_type(options, (Mapping, type(None)), name, "a dictionary")
         self._keywords = {
             "form_compiler_options": dict(form_compiler_options or {}),
-            "jit_options": {**JIT_OPTIONS, **(jit_options or {})},
+            "jit_options": dict(jit_options or {}),
         }
         self._data = {"points": Data(lambda: [V.mesh.geometry.x], decomposition.comm)}
         self.replace_stiffness(a)

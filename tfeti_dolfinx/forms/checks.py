@@ -18,7 +18,7 @@ from ufl.geometry import SpatialCoordinate
 from ufl.indexed import Indexed
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import JIT_OPTIONS, geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.validation import is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, known_tags
@@ -98,7 +98,7 @@ def check_not_negative(
     points = np.vstack((basix.geometry(cell_type), inside))
     cells = np.arange(len(geometry_dofmap(mesh)), dtype=np.int32)
     with raised_on_all_ranks(mesh.comm), named(what):
-        values = fem.Expression(value, points, jit_options=JIT_OPTIONS).eval(mesh, cells)
+        values = fem.Expression(value, points).eval(mesh, cells)
         values = np.asarray(values).reshape(len(cells), len(points))
         allowed = -rounding * np.abs(values).max(initial=0.0)  # 2πr on the axis
         wrong = ~(np.isfinite(values) & (values >= allowed))

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from ufl.algorithms.analysis import extract_arguments, extract_coefficients, extract_constants
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.compat import JIT_OPTIONS, interpolation_points
+from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.common.validation import POSITIVE, checked_callable, checked_number, named, shown
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.forms.checks import check_mesh, check_not_negative
@@ -110,11 +110,11 @@ def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     elements = (f.ufl_element() for f in extract_coefficients(expression))
     internal = (e.custom_quadrature()[0] for e in elements if e.has_custom_quadrature)
     if (points := next(internal, None)) is None:
-        function.interpolate(fem.Expression(expression, nodes, jit_options=JIT_OPTIONS))
+        function.interpolate(fem.Expression(expression, nodes))
         return function
     layout, bs = np.asarray(W.dofmap.list), W.dofmap.index_map_bs
     cells = np.arange(len(layout), dtype=np.int32)
-    there = fem.Expression(expression, points, jit_options=JIT_OPTIONS).eval(W.mesh, cells)
+    there = fem.Expression(expression, points).eval(W.mesh, cells)
     terms = slice(None) if len(points) > points.shape[1] else slice(1)
     linear = [np.column_stack((np.ones(len(x)), x))[:, terms] for x in (nodes, points)]
     fit = linear[0] @ np.linalg.pinv(linear[1])
@@ -196,16 +196,13 @@ class StressRecovery:
             # stress), or it has no derivative of u, and its error is of higher order (axisymmetry)
             e = ufl.as_tensor([[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, 0]])
         points = interpolation_points(W)
-        self._pairs = [
-            (fem.Expression(tensor, points, jit_options=JIT_OPTIONS), fem.Function(W))
-            for tensor in (sigma, e)
-        ]
+        self._pairs = [(fem.Expression(tensor, points), fem.Function(W)) for tensor in (sigma, e)]
         self.cells = fem.functionspace(mesh, ("DG", 0))
         self.cell_dof = np.asarray(self.cells.dofmap.list)[:, 0]
         stress, strain = (function for _, function in self._pairs)
         dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree + 1})
         density = thickness * ufl.inner(stress, strain) * ufl.TestFunction(self.cells)
-        self._form = fem.form(density * dx, jit_options=JIT_OPTIONS)
+        self._form = fem.form(density * dx)
 
     def squares(self) -> Array:
         """∫(σ* − σ_h) : (ε* − ε_h) over each local cell, shape ``(cells,)``."""

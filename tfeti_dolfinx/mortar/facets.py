@@ -14,7 +14,7 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.compat import JIT_OPTIONS, geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks, count_over
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -335,7 +335,7 @@ def hat_integrals(dofs: TornDofs, names: Sequence[str | int], thickness: Any = 1
     tags = tuple(sorted({decomposition.surface(name) for name in names}))
     ds = ufl.Measure("ds", domain=W.mesh, subdomain_data=decomposition.facet_tags)
     weight = fem.Constant(W.mesh, thickness) if isinstance(thickness, float) else thickness
-    form = fem.form(weight * ufl.TestFunction(W) * ds(tags), jit_options=JIT_OPTIONS)
+    form = fem.form(weight * ufl.TestFunction(W) * ds(tags))
     per_node = np.zeros(dofs.num_nodes)
     per_node[node] = fem.assemble_vector(form).array
     return dofs.reduce(per_node, np.add)
