@@ -1,6 +1,6 @@
 """Recovery of displacements from multipliers: u = K⁺(f − Bᵀλ) + Rα."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -37,17 +37,14 @@ def recover(
     gradient: Array,
     face: Face,
     error: float,
-    begin: Array | float,
     no_effect: float = 10.0,
     damping: float = 1e-8,
 ) -> Recovered:
-    """u = K⁺(f − Bᵀλ) + Rα, as near to another displacement as rows let bodies be. Collective.
+    """u = K⁺(f − Bᵀλ) + Rα, and the motions that no row with a force resists. Collective.
 
     α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for ν, the gaps of open rows
     as the solver left them. A step of the damped normal equations on the rows f that the face
     holds (equalities, λ_N > 0) makes theirs as small as α can: gaps may be far larger than u.
-    Motions that no row with a force resists are the solver's only by chance: of these places the
-    nearest to ``begin`` is taken, in the mean square over each body, that overlaps nowhere.
 
     Args:
         constraints: B and c.
@@ -56,7 +53,6 @@ def recover(
         gradient: Fλ − d up to the range of Gᵀ; on rows that the face does not hold it is ν.
         face: The face of λ.
         error: How large multipliers may be by the solver's error alone.
-        begin: The other displacement, shape ``(n,)``.
         no_effect: Of that: a larger force of a normal counts.
         damping: Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less would
             answer with their rounding over this share.
@@ -83,23 +79,21 @@ def recover(
     rows = constraints.sets.tangents[at]
     active[rows] = (borne[constraints.pressed_by[at]] | np.any(borne[rows], axis=1))[:, None]
     active &= face.carrying
-    loose = coarse.unresisted(active)
-    if loose.count:
-        motion = coarse.motions @ _motion_towards(coarse, loose, gap, active, begin - u)
-        u, gap = u + coarse.kernel_motion(motion), gap - coarse.Gt @ motion
-    return Recovered(np.array(lam), u, gap, residual, active, loose)
+    return Recovered(np.array(lam), u, gap, residual, active, coarse.unresisted(active))
 
 
-def _motion_towards(
-    coarse: CoarseSpace, loose: Motions, gap: Array, active: Array, way: Array
-) -> Array:
-    """Return of motions that overlap nowhere the nearest to a displacement. Collective."""
-    comm, N = coarse.comm, bcast_from_root(coarse.comm, orthonormal_columns(loose.columns))
-    wanted = N.T @ coarse.bodies.part_of(way)
-    rows = coarse.bounded[~active[coarse.bounded]]
+def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float) -> Recovered:
+    """Return an iterate with its bodies as near to another displacement as rows let. Collective.
+
+    Motions that no row with a force resists are the solver's only by chance: of these places the
+    nearest to ``begin`` is taken, in the mean square over each body, that overlaps nowhere.
+    """
+    comm, N = coarse.comm, bcast_from_root(coarse.comm, orthonormal_columns(state.loose.columns))
+    wanted = N.T @ coarse.bodies.part_of(begin - state.u)
+    rows = coarse.bounded[~state.active[coarse.bounded]]
     own = (
         rows_of(coarse.J.csr() @ N, rows).csr(),
-        np.maximum(gap[rows], 0.0) / coarse.row_size[rows],
+        np.maximum(state.gap[rows], 0.0) / coarse.row_size[rows],
     )
     ranks, motion = comm.gather(own, root=0), None
     with raised_on_all_ranks(comm):
@@ -108,7 +102,9 @@ def _motion_towards(
             C, g, motion = csr_array(vstack(closing)), np.concatenate(gaps), np.array(wanted)
             for part, at, dense in parts_of_columns(C):
                 motion[part] = least_distance(dense, g[at], wanted[part])
-    return np.asarray(N @ bcast_from_root(comm, motion))
+    alpha = coarse.motions @ np.asarray(N @ bcast_from_root(comm, motion))
+    u, gap = state.u + coarse.kernel_motion(alpha), state.gap - coarse.Gt @ alpha
+    return replace(state, u=u, gap=gap)
 
 
 def least_distance(C: Array, g: Array, t: Array) -> Array:

@@ -1,7 +1,7 @@
 """The stopping rule: the displacement of each body is right."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -10,7 +10,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import energy_bound, within
-from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
+from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, placed, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, QPResult, StoppingRule
 from tfeti_dolfinx.qp.sets import Face
@@ -227,7 +227,7 @@ class Accuracy(StoppingRule):
         # where nothing drives any force, rows that only just touch have forces that are rounding
         drives = reference > self._rounding
         self._small = 0.01 * max(rtol * reference, self._rounding) if drives else self._rounding
-        self.looks = 0
+        self.looks, self._stopped = 0, False
         self.recovered: Recovered | None = None
         self._before: Measures | None = None
         # of a look with other multipliers: the first one's errors
@@ -236,8 +236,20 @@ class Accuracy(StoppingRule):
         self.reached: list[TargetStatus] = []
 
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
-        """Assess an iterate, and return why to stop, or ITERATING. Collective."""
+        """Assess an iterate, and return why to stop, or ITERATING. Collective.
+
+        Only in an answer bodies are placed: a rough iterate has forces too small to hold them.
+        """
         self.look(lam, gradient, face, residual)
+        reason = self._verdict(residual)
+        assert self.recovered is not None
+        if self.recovered.loose.count and (reason > 0 or self._stopped):
+            self._place(face)
+            reason = self._verdict(residual)
+        return reason
+
+    def _verdict(self, residual: float) -> ConvergedReason:
+        """Return why to stop, or ITERATING, by what the last look has seen. Collective."""
         given, now = self._limits, self.measures
         # 1. errors over their tolerances; forces of a body that falls far may be known better
         # than the rounding of its fall allows, but for those that move nothing beyond rounding
@@ -268,8 +280,16 @@ class Accuracy(StoppingRule):
         """Recover the displacement of an iterate, and measure it. Collective."""
         dual = self._dual
         error = residual / self.norm
-        given = lam, gradient, face, error, dual.begin
-        self._measure(recover(dual.constraints, dual.coarse, *given), face)
+        self._measure(recover(dual.constraints, dual.coarse, lam, gradient, face, error), face)
+
+    def _place(self, face: Face) -> None:
+        """Place bodies that nothing holds, and measure the last look again. Collective."""
+        assert self.recovered is not None
+        change, before, looks = self.measures.change, self._before, self.looks
+        del self.reached[looks - 1 :]
+        self._measure(placed(self._dual.coarse, self.recovered, self._dual.begin), face)
+        self.measures = replace(self.measures, change=change)
+        self._before, self.looks = before, looks
 
     def _measure(self, state: Recovered, face: Face) -> None:
         """Measure the displacement of an iterate. Collective."""
@@ -302,7 +322,7 @@ class Accuracy(StoppingRule):
 
     def examine_stopped(self, result: QPResult) -> None:
         """Assess where a solver has stopped early: errors that rounding explains are accepted."""
-        self._small = float("inf")
+        self._small, self._stopped = float("inf"), True
         residual = max(result.projected_gradient, result.norm * result.equality)
         reason = self.examine(result.lam, result.gradient, result.face, residual)
         if reason > 0:
