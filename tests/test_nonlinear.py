@@ -331,6 +331,7 @@ def small(comm):
     ("change", "said"),
     [
         ({"F": "square"}, "F is not a linear form"),
+        ({"F": "energy", "J": None}, "F has no test function; expected a linear form, such as"),
         ({"J": "skew"}, "not symmetric .* or the tangent of an energy"),
         ({"finite": True}, "no J"),
         ({"finite": True, "J": None}, "takes a rotation for a stretch"),
@@ -343,10 +344,9 @@ def test_mistakes_are_named(change, said, comm):
     decomposition, u, v, elastic, _, bc = small(comm)
     du = ufl.TrialFunction(u.function_space)
     forms = {"F": elastic.a(u, v), "J": elastic.a(du, v)}
-    if change.get("F") == "square":
-        change = {"F": ufl.inner(v, v) * ufl.inner(u, v) * ufl.dx}
-    if change.get("J") == "skew":
-        change = {"J": forms["J"] + 0.1 * du[0].dx(1) * v[1] * ufl.dx}
+    meant = {"square": ufl.inner(v, v) * ufl.inner(u, v) * ufl.dx, "energy": u[0] ** 2 * ufl.dx}
+    meant["skew"] = forms["J"] + 0.1 * du[0].dx(1) * v[1] * ufl.dx
+    change = {k: meant[to] if isinstance(to, str) else to for k, to in change.items()}
     given = {**forms, "u": u, **change}
     F, u = given.pop("F"), given.pop("u")
     with pytest.raises(tfeti.InputError, match=said):

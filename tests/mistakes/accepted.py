@@ -50,6 +50,9 @@ ACCEPTED = {
     "ds with a list for data": lambda s: solved(
         s, L=traction(s, s.ds([(2, pairs(s, "right")), (4, pairs(s, "top"))]), 4)
     ),
+    "a graded foundation": lambda s: solved(
+        s, a=s.a + s.u[0] * s.v[0] / (1 + ufl.SpatialCoordinate(s.d.mesh)[0]) * s.dx
+    ),
     "a derivative of an energy": lambda s: solved(
         s,
         a=ufl.derivative(

@@ -30,6 +30,7 @@ CONTACTS = {
     r"^joint: both are the same surface": lambda s: s.with_contacts(
         tfeti.Contact("left", "left", name="joint")
     ),
+    r"^obstacle of surface a Plane: .* is met by an Obs": surface(tfeti.Plane((0, 0), (0, 1))),
     r"surface 'nothing' has no facets; expected a part of the boundary": surface("nothing"),
     r"obstacle of surface 'top': the surface faces away from it; expected": surface("top"),
     r"contacts: the pair of \('left', 'right'\) is there twice": lambda s: s.with_contacts(

@@ -74,7 +74,7 @@ THICKNESS = {
     ),
     r"thickness=0: expected a positive number": lambda s: s.problem(thickness=0),
     r"a divides a displacement .* axisymmetric body does, and thickness is 1": lambda s: s.problem(
-        a=elastic(s, model="axisymmetric").a(s.u, s.v), contacts=[FLOOR]
+        a=s.a + s.u[0] * (1 / ufl.SpatialCoordinate(s.d.mesh)[0]) * s.v[0] * s.dx, contacts=[FLOOR]
     ),
     r"thickness is of shape \(2,\)": lambda s: s.problem(thickness=fem.Function(s.V)),
     r"thickness has a test or trial function": lambda s: s.problem(thickness=s.v[0]),

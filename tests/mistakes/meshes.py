@@ -52,9 +52,8 @@ MESHES = {
 
 SUBDOMAINS = {
     r"subdomains=0: expected between 1 and 4, the number of cells": parts(0),
-    r"array subdomains: expected whole numbers from 0 up, got -1": lambda s: torn(
-        s, np.full(cells(s), -1)
-    ),
+    r"^subdomains: expected a number of subdomains, .*, got 4.0": parts(4.0),
+    r"array subdomains: expected whole .*, got -1": lambda s: torn(s, np.full(cells(s), -1)),
     r"callable subdomains: expected one id for each .*got an array of shape \(3, \d\)": parts(
         lambda x: (x > 0.5).astype(int)
     ),

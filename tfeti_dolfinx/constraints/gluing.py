@@ -263,8 +263,8 @@ class Gluing:
         if overlaps:
             raise NoSolutionError(
                 "an obstacle or a contact lies within a part of the surface whose displacement is "
-                f"prescribed: {overlaps} nodes penetrate by up to {-deepest:.6g} whatever the rest "
-                "does"
+                f"prescribed: {overlaps} node{'s penetrate' if overlaps > 1 else ' penetrates'} by "
+                f"up to {-deepest:.6g} whatever the rest does"
             )
         along = np.einsum("ntg,ng->nt", records.tangents, held)
         slips = (self.slip - along)[tangents.condition]

@@ -232,7 +232,7 @@ class Obstacle(ContactPartner):
     displacement: Law | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        self._check_data(f"obstacle of surface {self.surface!r}")
+        self._check_data(f"obstacle of surface {_written(self.surface)}")
         check_shape(self.shape, self.name)
         if self.displacement is not None:
             if isinstance(self.shape, RigidBody):
@@ -368,7 +368,7 @@ class Contact(ContactPartner):
     secondary: str | int = "auto"
 
     def __post_init__(self) -> None:
-        self._check_data(f"contact of {self.a!r} with {self.b!r}")
+        self._check_data(f"contact of {_written(self.a)} with {_written(self.b)}")
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
@@ -491,6 +491,11 @@ class Contact(ContactPartner):
                 f'{self.name}: secondary={self.secondary!r}, expected one of its surfaces or "auto"'
             ) from None
         return replace(self, a=self.b, b=self.a) if named else self
+
+
+def _written(surface: object) -> str:
+    """Return what was given for a surface, as names of contacts have it."""
+    return repr(surface) if is_whole(surface) or isinstance(surface, str) else shown(surface)
 
 
 def _ratios(

@@ -7,15 +7,20 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from ufl.algebra import Division
+from ufl.algebra import Abs, Division, Power, Product, Sum
 from ufl.algorithms import compute_form_data, extract_arguments
 from ufl.algorithms.check_arities import ArityMismatch
-from ufl.constantvalue import Zero
+from ufl.conditional import Conditional, MaxValue
+from ufl.constantvalue import ScalarValue, Zero
 from ufl.core.terminal import FormArgument
-from ufl.corealg.traversal import unique_pre_traversal
+from ufl.corealg.traversal import unique_post_traversal, unique_pre_traversal
+from ufl.differentiation import Derivative
 from ufl.domain import extract_domains
 from ufl.geometry import SpatialCoordinate
 from ufl.indexed import Indexed
+from ufl.mathfunctions import Sqrt
+from ufl.tensoralgebra import Dot, Inner
+from ufl.variable import Variable
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
@@ -65,16 +70,12 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
 
 
 def is_axisymmetric(form: Any, name: str, thickness: Any) -> bool:
-    """Return whether a form has u_r/r, r = x[0]; raise an InputError if the thickness is 1 then."""
+    """Return whether a form has u_r/r, r = x[0]; raise an InputError if the thickness is 1 then.
 
-    def has(expression: Any, kind: type) -> bool:
-        parts = (part for part in unique_pre_traversal(expression) if isinstance(part, Indexed))
-        found = (part for part in parts if isinstance(part.ufl_operands[0], kind))
-        return any(kind is FormArgument or int(part.ufl_operands[1][0]) == 0 for part in found)
-
-    parts = (p for part in form.integrals() for p in unique_pre_traversal(part.integrand()))
-    divisions = (part.ufl_operands for part in parts if isinstance(part, Division))
-    ring = any(has(u, FormArgument) and has(r, SpatialCoordinate) for u, r in divisions)
+    It may be u_r·(1/r) or u_r·r⁻¹, too. Derivatives of u over r are none, as where moduli are
+    graded, nor is u over what is not 0 on the axis, as on a graded foundation.
+    """
+    ring = any(_has_hoop_strain(part.integrand()) for part in form.integrals())
     if ring and not isinstance(thickness, ufl.core.expr.Expr) and thickness == 1.0:
         raise InputError(
             f"{name} divides a displacement by a coordinate, as that of an axisymmetric body "
@@ -157,6 +158,43 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
                 f"{name}: the {what} is on another mesh (the one before decompose?); "
                 f"expected decomposition.mesh, the torn mesh{how}"
             )
+
+
+def _has_hoop_strain(integrand: Any) -> bool:
+    """Return whether components of displacements, not derivatives, are multiplied with 1/r."""
+    # of each part: whether such components are in it, and 1/r
+    found: dict[Any, tuple[bool, bool]] = {}
+    for part in unique_post_traversal(integrand):
+        of = [found[operand] for operand in part.ufl_operands]
+        moves, inverse = any(m for m, _ in of), any(r for _, r in of)
+        if isinstance(part, Indexed) and isinstance(part.ufl_operands[0], FormArgument):
+            moves = True  # a component; a load may be b·v/r
+        elif isinstance(part, Derivative) and len(of) == 1:  # a gradient
+            moves = inverse = False
+        elif isinstance(part, Division) and _is_radius(part.ufl_operands[1]):
+            if of[0][0]:
+                return True
+            inverse = True
+        elif isinstance(part, Power) and isinstance(part.ufl_operands[1], ScalarValue):
+            inverse |= float(part.ufl_operands[1]) < 0 and _is_radius(part.ufl_operands[0])
+        elif isinstance(part, (Product, Dot, Inner)) and (
+            (of[0][0] and of[1][1]) or (of[0][1] and of[1][0])
+        ):
+            return True
+        found[part] = (moves, inverse)
+    return False
+
+
+def _is_radius(part: Any) -> bool:
+    """Return whether an expression is 0 where x[0] is, or a tiny number there."""
+    operands = part.ufl_operands
+    if isinstance(part, Indexed) and isinstance(operands[0], SpatialCoordinate):
+        return int(operands[1][0]) == 0
+    if isinstance(part, Sum):
+        tiny = [isinstance(o, ScalarValue) and abs(float(o)) < 1e-3 for o in operands]
+        return all(_is_radius(o) or small for o, small in zip(operands, tiny, strict=True))
+    kinds = (Product, Power, Abs, Sqrt, Variable, MaxValue, Conditional)
+    return isinstance(part, kinds) and any(_is_radius(operand) for operand in operands)
 
 
 def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:

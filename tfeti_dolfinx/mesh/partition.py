@@ -111,6 +111,7 @@ def given_subdomains(mesh: UntornMesh, subdomains: Subdomains, comm: MPI.Intraco
                 ids = subdomains(midpoints)
             array = np.asarray(ids)
         if array.ndim == 0 or array.dtype.kind not in "biuf":
+            what = what.removeprefix("array ")  # it is none
             raise InputError(
                 f"{what}: expected a number of subdomains, one whole number for each cell or a "
                 f"callable that returns them, got {shown(ids)}"

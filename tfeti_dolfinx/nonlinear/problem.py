@@ -110,6 +110,9 @@ class NonlinearContactProblem(ContactProblem):
             given["update"] = "not given" if update is None else "given"
             checked_type(u, fem.Function, "u", "the dolfinx.fem.Function that F is a residual of")
             checked_type(F, ufl.Form, "F", "a linear form")
+            if not F.arguments():
+                expected = "a linear form, such as the derivative of an energy"
+                raise InputError(f"F has no test function; expected {expected}")
             if update is not None:
                 checked_callable(update, "update", "a function without arguments")
             if finite and J is not None:
@@ -194,7 +197,7 @@ class NonlinearContactProblem(ContactProblem):
                 if step == 0:
                     raise
                 raise ConvergenceError(
-                    f"Newton's method: after {step} steps {error}; or smaller load steps"
+                    f"Newton's method: in step {step + 1} {error}; or smaller load steps"
                 ) from error
             self._counts.newton_steps += 1
             end = self._conforming(u, np.array(self.u.x.array))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import logging
 import math
 import os
@@ -231,7 +232,10 @@ class LoadSteps:
         checked_type(problem, ContactProblem, "problem", "a tfeti_dolfinx.ContactProblem")
         self._comm = problem.decomposition.comm
         with agreeing(self._comm, "LoadSteps") as given:
-            checked_callable(apply, "apply", "a function of the problem and a time")
+            expected = "a function of the problem and a time"
+            checked_callable(apply, "apply", expected)
+            with named(f"apply: expected {expected}"):
+                inspect.signature(apply).bind(problem, begin)
             if not is_whole(max_halvings) or not 0 <= max_halvings <= MOST_HALVINGS:
                 raise InputError(
                     f"max_halvings={shown(max_halvings)}: expected an integer, 0 to {MOST_HALVINGS}"
