@@ -196,9 +196,8 @@ def test_a_block_that_turns_on_another_one_gains_no_energy(comm):
 
 def bar(comm):
     """A plastic bar that hits a wall; the plastic strain is an internal variable."""
-    mesh = dmesh.create_rectangle(
-        comm, [[0.0, 0.0], [3.0, 1.0]], (6, 2), dmesh.CellType.quadrilateral
-    )
+    box = [[0.0, 0.0], [3.0, 1.0]], (6, 2)
+    mesh = dmesh.create_rectangle(comm, *box, dmesh.CellType.quadrilateral)
     sides = {"left": lambda x: np.isclose(x[0], 0.0)}
     d = tfeti.decompose(mesh, 3, surfaces=sides)
     V, u, v, du = unknowns(d)
