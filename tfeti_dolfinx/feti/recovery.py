@@ -1,6 +1,7 @@
 """Recovery of displacements from multipliers: u = K⁺(f − Bᵀλ) + Rα."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -88,7 +89,7 @@ def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float) -> Recov
     Motions that no row with a force resists are the solver's only by chance: of these places the
     nearest to ``begin`` is taken, in the mean square over each body, that overlaps nowhere.
     """
-    comm, N = coarse.comm, bcast_from_root(coarse.comm, orthonormal_columns(state.loose.columns))
+    comm, N = coarse.comm, _basis(coarse, state)
     wanted = N.T @ coarse.bodies.part_of(begin - state.u)
     rows = coarse.bounded[~state.active[coarse.bounded]]
     own = (
@@ -105,6 +106,19 @@ def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float) -> Recov
     alpha = coarse.motions @ np.asarray(N @ bcast_from_root(comm, motion))
     u, gap = state.u + coarse.kernel_motion(alpha), state.gap - coarse.Gt @ alpha
     return replace(state, u=u, gap=gap)
+
+
+def without_loose(coarse: CoarseSpace, state: Recovered, u: Array) -> Array:
+    """Return a displacement without the motions that no row with a force resists. Collective."""
+    if not state.loose.count:
+        return u
+    N = _basis(coarse, state)
+    return u - coarse.kernel_motion(coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(u))))
+
+
+def _basis(coarse: CoarseSpace, state: Recovered) -> Any:
+    """Return an orthonormal basis of the loose motions, the same on all ranks. Collective."""
+    return bcast_from_root(coarse.comm, orthonormal_columns(state.loose.columns))
 
 
 def least_distance(C: Array, g: Array, t: Array) -> Array:

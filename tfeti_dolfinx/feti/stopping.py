@@ -10,7 +10,13 @@ from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import energy_bound, within
-from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, placed, recover
+from tfeti_dolfinx.feti.recovery import (
+    Recovered,
+    min_norm_correction,
+    placed,
+    recover,
+    without_loose,
+)
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, QPResult, StoppingRule
 from tfeti_dolfinx.qp.sets import Face
@@ -51,7 +57,7 @@ class Measures:
     energies: Array  # uᵀKu of each body
     correction: Array  # largest displacement v of each body that closes jumps and overlaps
     correction_energies: Array  # vᵀ diag(K) v, its diagonal as in D the mean at each node
-    change: Array  # largest change of each body since the iterate before, or 0
+    change: Array  # largest change of each body since the iterate before, loose motions apart, or 0
     alone: Array  # largest displacement K⁺f of the trace of each body
     stiffness: Array  # trace of K on the trace unknowns of each body
     # deepest overlap, distance of a row that carries a force, or slip that friction does not allow
@@ -123,7 +129,7 @@ def measure(
         u,
         u - subdomains.modes_motion(bodies.amounts(bodies.part_of(u))),
         subdomains.extended(v),
-        np.zeros_like(u) if before is None else u - before,
+        np.zeros_like(u) if before is None else without_loose(dual.coarse, state, u - before),
         subdomains.extended(subdomains.pinv_load[subdomains.trace]),
     )
     size, elastic, correction, change, alone = subdomains.body_sizes(displacements)
