@@ -261,6 +261,7 @@ def test_mistakes(shared_tmp):
     file.touch()
     wrong = {
         "problem is None; expected a tfeti_dolfinx.ContactProblem": {"problem": None},
+        "apply is 5; expected a function of the problem and a time": {"apply": 5},
         "apply: expected a function of the problem and a time: ": {"apply": lambda t: None},
         "times is 1.0; expected a list of increasing numbers": {"times": 1.0},
         "times is empty; expected at least one time": {"times": []},

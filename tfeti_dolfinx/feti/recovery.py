@@ -1,7 +1,6 @@
 """Recovery of displacements from multipliers: u = K⁺(f − Bᵀλ) + Rα."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -116,7 +115,7 @@ def without_loose(coarse: CoarseSpace, state: Recovered, u: Array) -> Array:
     return u - coarse.kernel_motion(coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(u))))
 
 
-def _basis(coarse: CoarseSpace, state: Recovered) -> Any:
+def _basis(coarse: CoarseSpace, state: Recovered) -> csr_array:
     """Return an orthonormal basis of the loose motions, the same on all ranks. Collective."""
     return bcast_from_root(coarse.comm, orthonormal_columns(state.loose.columns))
 
