@@ -125,12 +125,14 @@ def kernel_of(K: Any, modes: Array) -> Array:
     turn = np.linalg.eigh(R0.T @ KR0)[1]
     R = R0 @ turn
     energy = np.sum(R * (KR0 @ turn), axis=0)
-    # In flat cells entries are differences of far larger numbers, which are as large as those that
-    # other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
-    largest = np.maximum.reduceat(K.diagonal()[K.indices], K.indptr[:-1])
-    sizes = np.sqrt(largest)[:, None] * np.abs(R)
-    terms = np.sum(sizes**2, axis=0)  # those of the diagonal, which are often enough
+    diagonal = K.diagonal()
+    terms = diagonal @ R**2  # those of the diagonal, which are often enough
     if np.any(energy > TOLERANCES.null * terms):
+        # In flat cells entries are differences of far larger numbers, which are as large as those
+        # that other unknowns of the cell have: the largest diagonal entry that a row meets bounds
+        # them.
+        largest = np.maximum.reduceat(diagonal[K.indices], K.indptr[:-1])
+        sizes = np.sqrt(largest)[:, None] * np.abs(R)
         pattern = LocalMatrix(Entries(np.ones(len(K.data)), K.indices, K.indptr, K.shape))
         terms = np.sum(sizes * (pattern @ sizes), axis=0)
     return np.asarray(R[:, energy <= TOLERANCES.null * terms])
