@@ -48,7 +48,7 @@ class DirectionStore:
         rows, at = self._rows, self._next
         if at == rows.shape[1]:
             more = min(max(at, 8), self.capacity - at)
-            rows = np.empty((2, at + more, rows.shape[2]))  # no page of it is there before its use
+            rows = np.empty((2, at + more, rows.shape[2]))  # memory comes as rows are filled
             rows[:, :at] = self._rows
         rows[0, at], rows[1, at] = p, image
         self._hold(rows, max(self.count, at + 1), (at + 1) % self.capacity)
