@@ -44,6 +44,7 @@ MECHANISMS = {
     "newton_on_coulomb": "Newton's method on Coulomb's law, before bounds as a fixed point",
     "late_schur": "steps of the lumped preconditioner, where subdomains are large, until S pays",
     "foundation": "a first point of rigid bodies on springs, not the lightest forces that balance",
+    "mixed_precision": "factors of large subdomains in space in single precision, with refinement",
     "cautious": "constraints leave an active set one by one after a step that raised the energy",
 }
 # those that an option of their own switches off

@@ -457,7 +457,8 @@ class ContactProblem:
     # -------------------------------------------------------------- load steps
 
     def take_step(self, size: float) -> None:
-        """Say how long the next load step is: without inertia it does not matter."""
+        """Say how long the next load step is: without inertia that many solves come is all."""
+        self._system.how.mixed = False  # single precision pays in one alone
 
     def accept(self) -> None:
         """Take the last solution as the end of a load step. Collective.

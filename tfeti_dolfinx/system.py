@@ -13,6 +13,7 @@ from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank, count_over
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
+from tfeti_dolfinx.contact.friction import Coulomb
 from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
 from tfeti_dolfinx.contact.records import ContactRecords, Friction, condition_areas, slips
 from tfeti_dolfinx.contact.search import ContactSearch
@@ -29,9 +30,10 @@ from tfeti_dolfinx.solve.solver import resolved
 from tfeti_dolfinx.subdomains.block import RigidBlock, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.factor import added_options, say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import TOLERANCES as INVERSES
-from tfeti_dolfinx.subdomains.kplus import InverseFactory, regularised
+from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
-from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
+from tfeti_dolfinx.subdomains.mixed import MIXED
+from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock, outline
 from tfeti_dolfinx.subdomains.subdomains import (
     FiniteElements,
     MakeBlock,
@@ -70,7 +72,12 @@ class Settings:
 
     def inverses(self) -> InverseFactory:
         """Return a factory of the subdomains' generalised inverses."""
-        return InverseFactory(self.extensions.kplus or regularised, f"{self.prefix}sub_")
+        own, options = self.extensions, self.options
+        # SMALSE-M multiplies by F itself, as clusters do when they make theirs
+        plain = options.qp_type == "smalse" or own.subdomains is not None
+        mixed = not plain and options.local_type != "explicit"
+        mixed &= "mixed_precision" not in options.without and options.number >= MIXED.rtol
+        return InverseFactory(own.kplus, f"{self.prefix}sub_", mixed=mixed)
 
     def make_subdomains(
         self,
@@ -93,6 +100,9 @@ class Settings:
         found = equals if choice.type in ("auto", "shared") else None
         keeps = own.subdomains is not None or "soft_springs" in options.without
         equals.how.soft = 0.0 if keeps else INVERSES.weak if tangents else INVERSES.soft
+        x = dofs.points()[:, : decomposition.mesh.geometry.dim]
+        outlines = Counter(map(outline, np.split(x, dofs.node_offsets[1:-1]) if found else ()))
+        equals.how.shared = {one for one, count in outlines.items() if count > 1}
         make = own.block or (lambda item: SparseBlock(item, equals.how, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
@@ -470,6 +480,11 @@ class System(Generic[OwnForms]):
 
     def _factor(self) -> None:
         dofs, trace = self._dofs, self.gluing.constraints.trace
+        # single precision pays in one solve, without bounds that many programs look for
+        again = self.follows or self.inverses > 0
+        self.how.mixed &= not (
+            again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
+        )
         self._subdomains = self._settings.make_subdomains(
             subdomain_data(dofs, dofs.decomposition, self._K, self._f, trace),
             dofs,

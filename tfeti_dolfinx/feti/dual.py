@@ -98,7 +98,7 @@ class Dual:
     many directions of earlier solves are kept, ``"auto"``: none before ``learn``.
 
     Attributes:
-        F: B K⁺ Bᵀ.
+        F: B K⁺ Bᵀ; ``rough``: F to single precision where that costs less, else None.
         d: B K⁺ f − c, this rank's part.
         preconditioner: The preconditioner, or None; ``late``: itself, where it may change.
         coarse: The coarse space.
@@ -139,6 +139,7 @@ class Dual:
         self._stiffness = largest(comm, subdomains.diagonal)
         self._set_linear_term(comm)
         self.F = DualOperator(B, subdomains.local_operator("pinv"))
+        self.rough = None if isinstance(recycle, int) and recycle else self.F.rough
         self.preconditioner: DualOperator | None = None
         self._scaled: PETSc.Mat | None = None
         own = preconditioner in (dirichlet_preconditioner, chosen_preconditioner)
@@ -219,7 +220,11 @@ class Dual:
         return normals[self.law(self._given).project(pull)[normals] < 0.0]
 
     def learn(self) -> None:
-        """More solves come: keep directions, where options leave that open, and let S pay."""
+        """More solves come: keep directions, where options leave that open, and let S pay.
+
+        From then on images are those of F itself: from rough ones solves would begin too far off.
+        """
+        self.rough = None
         if self._learns and self.recycled is None:
             self.recycled = Recycled(LIMITS.recycled, self.coarse.comm)
         if self.late is not None:
@@ -302,6 +307,7 @@ class Dual:
             keeps="kept_directions" not in self._without,
             cautious="cautious" not in self._without,
             sprung=self.subdomains.num_springs > 0,
+            rough=self.rough,
             foundation=None if "foundation" in self._without else self.foundation,
         )
 

@@ -12,7 +12,8 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array, entries_of_rows, entries_within, joined, node_means
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.subdomains.local_operators import LocalOperator
+from tfeti_dolfinx.qp.problem import Operator
+from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalOperator
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -104,19 +105,29 @@ class DualOperator:
             if metric is not None:
                 metric.trace.prepare()
 
-    def __call__(self, x: Array) -> Array:
+    @property
+    def rough(self) -> Operator | None:
+        """The operator to single precision, if it costs less; else None. Collective."""
+        mixed = isinstance(self.local, GroupedOperator) and self.local.mixed
+        known = any_rank(self._w.getComm().tompi4py(), mixed)
+        return partial(self, roughly=True) if known else None
+
+    def __call__(self, x: Array, roughly: bool = False) -> Array:
         """B diag(A_s) Bᵀ x, from this rank's part of x to that of the product. Collective."""
         self._x.setArray(x)
         self.B.multTranspose(self._x, self._w)
-        self.multiply(self._w.array_r, self._v.array)
+        self.multiply(self._w.array_r, self._v.array, roughly)
         self.B.mult(self._v, self._x)
         return np.asarray(self._x.array_r + self.added * x)
 
-    def multiply(self, w: Array, out: Array) -> None:
+    def multiply(self, w: Array, out: Array, roughly: bool = False) -> None:
         """out = diag(A_s) w on this rank's trace, which counts as a multiplication."""
         self.count += 1
         start = perf_counter()
-        self.local.mult(w, out)
+        if roughly and isinstance(self.local, GroupedOperator):
+            self.local.mult(w, out, roughly)
+        else:
+            self.local.mult(w, out)
         self.seconds, self.times = self.seconds + perf_counter() - start, self.times + 1
 
     def destroy(self) -> None:

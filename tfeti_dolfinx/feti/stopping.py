@@ -303,6 +303,7 @@ class Accuracy(StoppingRule):
         now = measure(self._dual, state, face, self.norm, before)
         self._before = self.measures if self.looks else None
         self.recovered, self.measures, self.u = state, now, state.u
+        self.gradient = state.residual
         self.allowed = self._tolerances()
         self.looks, self.waits = self.looks + 1, False
         if self.goal is not None:

@@ -148,6 +148,9 @@ def pcpg(
         # test
         small = norm <= rule.tolerance
         reason = _examined(qp, point, rule, norm) if small else ConvergedReason.ITERATING
+        if small and reason == ConvergedReason.ITERATING and qp.rough is not None:
+            point.g = point.g if rule.gradient is None else rule.gradient
+            past, norm = _begun(qp, point, own)
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -166,7 +169,7 @@ def pcpg(
         if past is not None and recycled is not None:
             p = p - past(p, recycled.images)[0]
         # step
-        Fp = qp.F(p)
+        Fp = qp.roughly(p)
         PFp, pFp, pp, (rp,) = qp.coarse.project_against(Fp, p, np.array([r @ p]))
         own.p, left = p, r - (rp / pFp if pFp else 0.0) * PFp
         # ‖r‖², and rank 0's numbers, since loops end by them

@@ -182,7 +182,7 @@ def seen_norm(qp: QP, z: Point, short: float = NewtonParameters.short) -> float:
     p = qp.coarse.project(z.g)
     energy, size, pp, gg = qp.dot((z.lam, z.g + qp.d), (z.lam, z.lam), (p, p), (z.g, z.g))
     norm = energy / size if size > 0.0 else 0.0
-    return max(norm, qp.dot((p, qp.F(p)))[0] / pp) if pp > short**2 * gg else norm
+    return max(norm, qp.dot((p, qp.roughly(p)))[0] / pp) if pp > short**2 * gg else norm
 
 
 # --- State of the iteration -------------------------------------------------------------------
@@ -244,7 +244,10 @@ class NewtonIteration:
         if self.residual > max(rule.tolerance, self.rounding):
             return ConvergedReason.ITERATING
         rule.norm = self.norm
-        return rule.examine(self.z.lam, self.s, self.pressed, self.residual)
+        reason = rule.examine(self.z.lam, self.s, self.pressed, self.residual)
+        if reason == ConvergedReason.ITERATING and self.qp.rough is not None:
+            self.z = self.z if rule.gradient is None else Point(self.z.lam, rule.gradient)
+        return reason
 
     def wanted_face(self) -> tuple[Point, Face]:
         """Step 2: start and face of the next solve.
@@ -273,7 +276,7 @@ class NewtonIteration:
         if not any_rank(self.qp.coarse.comm, early):
             return z, face
         self.resume = False
-        return Point(self.back, z.g + self.qp.F(self.back - z.lam)), self.pressed
+        return Point(self.back, z.g + self.qp.roughly(self.back - z.lam)), self.pressed
 
     def accept(self, end: Point, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
@@ -303,7 +306,7 @@ class NewtonIteration:
         """Go along λ̂ − λ; return whether q falls."""
         z = self.z
         p = self.back - z.lam
-        Fp = self.qp.F(p)
+        Fp = self.qp.roughly(p)
         slope, curvature, size = self.qp.dot((-self.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
@@ -386,7 +389,7 @@ class FaceSolver:
             assert self._face is not None
             boundary = WithinFace(self._qp.feasible, self._face, slipping=True)
             found, _ = project_onto_feasible(self._qp.coarse, boundary, end.lam)
-            end = Point(found, end.g + self._qp.F(found - end.lam))
+            end = Point(found, end.g + self._qp.roughly(found - end.lam))
             out = imbalance(self._qp.coarse, found) > HELD
         return end, not out
 
@@ -405,8 +408,10 @@ class FaceSolver:
         self.coarse = qp.coarse.on_face(face)
         self._on_face = replace(qp, coarse=self.coarse, held=face.held, preconditioner=None)
         if self._curved:
-            F, bend = qp.F, face.bend
-            self._on_face = replace(self._on_face, F=lambda x: F(x) + bend(x), recycled=None)
+            F, bend = qp.roughly, face.bend
+            self._on_face = replace(
+                self._on_face, F=lambda x: F(x) + bend(x), rough=None, recycled=None
+            )
         return same
 
     def _blocked(self, z: Point, end: Point) -> Point:
@@ -425,7 +430,7 @@ class FaceSolver:
         s = end.g - qp.coarse.combined(self.coarse.coordinates(end.g))
         self._enter(qp.feasible.face(on, s))
         lam = on + self.coarse.combined(self.coarse.solve(qp.coarse.residual(on)))
-        return None if imbalance(qp.coarse, lam) > HELD else Point(lam, qp.F(lam) - qp.d)
+        return None if imbalance(qp.coarse, lam) > HELD else qp.moved(end, lam)
 
     def _has_left(self, z: Point) -> bool:
         """Return whether rows that do not slip are outside of Ω."""
@@ -473,7 +478,7 @@ class FaceSolver:
         """
         qp, given = self._qp, self._parameters
         exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
-        program = replace(self._on_face, F=qp.F, d=Fw, recycled=None)
+        program = replace(self._on_face, F=qp.F, rough=None, d=Fw, recycled=None)
         point, own = Point(np.zeros(len(way)), -Fw), Directions(replace(qp, keeps=True))
         pcpg(program, point, StoppingRule(exact), Steps(), given.purifying, directions=own)
         return way - point.lam, -point.g

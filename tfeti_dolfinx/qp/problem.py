@@ -69,6 +69,18 @@ class QP:
     # where so many rows carry together; None: unknown
     foundation: Callable[[int], Array] | None = None
     sprung: bool = False  # whether rows of soft springs are among those that balance the load
+    # F to single precision, for steps whose residuals an exact F sets right now and then; None: F
+    rough: Operator | None = None
+
+    def roughly(self, x: Array) -> Array:
+        """Return Fx to single precision or better, whichever costs less. Collective."""
+        return self.F(x) if self.rough is None else self.rough(x)
+
+    def moved(self, at: Point, lam: Array) -> Point:
+        """Return λ with Fλ − d, known at another point; multiply once. Collective."""
+        if self.rough is None:
+            return Point(lam, self.F(lam) - self.d)
+        return Point(lam, at.g + self.rough(lam - at.lam))  # its error is that of the way alone
 
     def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
         """Return xᵀy of pairs of vectors, rank 0's on every rank. Collective."""
@@ -276,6 +288,8 @@ class StoppingRule:
     norm: float = 1.0
     # whether an examination is to wait for solves on faces, whatever they aim at
     waits: bool = False
+    # Fλ − d of the iterate examined, if the examination has found it; it is exact
+    gradient: Array | None = None
 
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Examine an iterate whose residuals are small. Collective.

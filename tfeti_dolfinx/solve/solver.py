@@ -130,6 +130,10 @@ def solve_dual(
     if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
         late.steps = 0  # K_bb of thin parts spans more digits than S: begin again
         return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
+    broken = rounding or result.reason == ConvergedReason.DIVERGED_INDEFINITE_MAT
+    if broken and dual.rough is not None:
+        dual.rough = None  # what single precision does not tell: begin again with F itself
+        return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
     if (state := rule.recovered) is not None:
         dual.last.looked = state.lam, state.residual

@@ -97,7 +97,7 @@ class Predictor:
     def __init__(self, dofs: TornDofs, settings: Settings) -> None:
         self._dofs = dofs
         # of a mass there is little to learn, and no motion of it is soft
-        without = (*settings.options.without, "soft_springs")
+        without = (*settings.options.without, "soft_springs", "mixed_precision")
         options = replace(settings.options, recycle=0, without=without)
         self._settings = replace(settings, extensions=Extensions(), options=options)
         self._options = options
@@ -258,6 +258,7 @@ class ContactDynamics(ContactProblem):
         self._mass, self._velocity = mass, velocity
         self._with_thickness = others.get("thickness", 1.0)
         super().__init__(a, L, bcs, contacts, decomposition, **others)
+        self._system.how.mixed = False  # many solves come
         if self.options.rtol == "auto":
             raise InputError("rtol auto: errors of steps in time are not estimated; expected one")
         v = np.zeros_like(self.u.x.array)

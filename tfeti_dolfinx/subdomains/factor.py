@@ -90,6 +90,10 @@ class CholeskyFactor:
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
 
+    def roughly(self, b: Array) -> Array:
+        """A⁻¹ b to single precision or better, whichever costs less."""
+        return self.solve(b)
+
     def _solved(self, given: PETSc.Mat) -> PETSc.Mat:
         found = given.duplicate()
         self._factor.matSolve(given, found)

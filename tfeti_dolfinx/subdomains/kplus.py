@@ -1,14 +1,20 @@
 """The generalised inverse K⁺ of a subdomain, and why a stiffness has none."""
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, Entries, plus
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
+from tfeti_dolfinx.subdomains.mixed import MIXED, MixedFactor, cholmod
+
+log = logging.getLogger(__name__)
 
 # --- K⁺ -----------------------------------------------------------------------------------------
 
@@ -46,7 +52,17 @@ class GeneralisedInverse(Protocol):
 MakeInverse = Callable[[Any, Array, Array, str], GeneralisedInverse]
 
 
-def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> CholeskyFactor:
+# from a matrix and a prefix of options to its factor
+MakeFactor = Callable[[Any, str], CholeskyFactor]
+
+
+def regularised(
+    K: Any,
+    R: Array,
+    fixing_dofs: Array,
+    prefix: str = "tfeti_sub_",
+    factor: MakeFactor = CholeskyFactor,
+) -> CholeskyFactor:
     """Factor K_ρ = K + ρ Nᵀ(NNᵀ)⁻¹N, N the kernel on a few fixing unknowns, ρ = max diag K.
 
     K_ρ⁻¹ is an exact generalised inverse, because N R is regular (Brzobohatý, Dostál, Kozubek,
@@ -55,7 +71,7 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
     or ``Entries`` where R has no columns; the fixing unknowns ascend.
     """
     if R.shape[1] == 0:
-        return CholeskyFactor(K, prefix)
+        return factor(K, prefix)
     Q, _ = np.linalg.qr(R[fixing_dofs])
     # what moves in no motion may be far stiffer
     moves = np.abs(R).max(axis=1) > TOLERANCES.still * np.abs(R).max()
@@ -66,17 +82,50 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
     if not (kept := whole.data != 0.0).all():
         table = np.concatenate(([0], np.cumsum(kept)))[whole.indptr]
         whole = Entries(whole.data[kept], whole.indices[kept], table, K.shape)
-    return CholeskyFactor(whole, prefix)
+    return factor(whole, prefix)
 
 
 @dataclass
 class InverseFactory:
     """Factory of generalised inverses."""
 
-    kplus: MakeInverse = regularised  # makes the generalised inverse
+    kplus: MakeInverse | None = None  # makes the generalised inverse; None: `regularised`
     prefix: str = "tfeti_sub_"  # prefix of the factors' PETSc options
     factorizations: int = 0  # of this rank so far
     soft: float = TOLERANCES.soft  # springs below this are taken out of stiffnesses
+    mixed: bool = False  # whether large factors may be in single precision
+    # outlines that several subdomains have: they may be equal, and apply one factor at once
+    shared: Collection[bytes] = ()
+
+    def inverse(self, K: Any, R: Array, fixing_dofs: Array, mixed: bool) -> GeneralisedInverse:
+        """Make the generalised inverse of a stiffness, whose factor may be ``mixed``.
+
+        Raise as ``regularised``.
+        """
+        if self.kplus is not None:
+            return self.kplus(K, R, fixing_dofs, self.prefix)
+        return regularised(K, R, fixing_dofs, self.prefix, self.factor if mixed else CholeskyFactor)
+
+    def factor(self, A: Any, prefix: str) -> CholeskyFactor:
+        """Return a factor in single precision where that pays and does, else PETSc's.
+
+        Options with the prefix are PETSc's, and ask for its factor. Where single precision does not
+        do for one, it is not tried again: others are like it. Raise as ``CholeskyFactor``.
+        """
+        pays = self.mixed and MIXED.size <= A.shape[0] <= MIXED.most
+        own = cholmod() if pays else None
+        if own is not None and not PETSc.Options(prefix).getAll():
+            try:
+                return MixedFactor(A, own, partial(self._exact, prefix))
+            except ArithmeticError as error:
+                log.debug("a factor of %d unknowns: %s", A.shape[0], error)
+                self.mixed = False
+        return CholeskyFactor(A, prefix)
+
+    def _exact(self, prefix: str, A: Any) -> CholeskyFactor:
+        """Make a factor in the place of one in single precision."""
+        self.factorizations += 1
+        return CholeskyFactor(A, prefix)
 
 
 # --- Causes of indefinite stiffnesses -----------------------------------------------------------

@@ -46,6 +46,7 @@ class Group:
     dense: Array | None = None  # a, where that is cheaper
     stiffness: Stiffness | None = None  # of a K⁺: on what trace this is known makes S dense, too
     trace: Array | None = None  # this trace, ascending
+    rough: Callable[[Array], Array] | None = None  # as `apply`, to single precision for less
 
     def prefers_dense(self, choice: LocalChoice) -> bool:
         """Return whether the group takes a dense matrix: by its type, or for fewer operations.
@@ -62,16 +63,17 @@ class Group:
         times = choice.multiplications * (2 if self.stiffness and self.columns == 1 else 1)
         return times * (once - dense) > self.work * self.size
 
-    def mult(self, w: Array, out: Array) -> None:
+    def mult(self, w: Array, out: Array, roughly: bool = False) -> None:
         """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
+        apply = self.rough if roughly and self.rough is not None else self.apply
         if isinstance(self.where, slice):
             own = w[self.where]
-            out[self.where] = self.apply(own) if self.dense is None else dsymv(1.0, self.dense, own)
+            out[self.where] = apply(own) if self.dense is None else dsymv(1.0, self.dense, own)
             return
         flat = np.zeros(self.size * self.columns)
         flat[self.place] = w[self.where]
         columns = flat.reshape((self.size, self.columns), order="F")
-        product = self.apply(columns) if self.dense is None else dsymm(1.0, self.dense, columns)
+        product = apply(columns) if self.dense is None else dsymm(1.0, self.dense, columns)
         out[self.where] = product.ravel(order="F")[self.place]
 
 
@@ -98,16 +100,20 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     traces = [block.place[block.trace_dofs] for block, _ in equal]
     trace = np.unique(np.concatenate(traces))
 
-    def apply(W: Array) -> Array:
+    def solved(solve: Callable[[Array], Array], W: Array) -> Array:
         B = np.zeros((stiffness.size, *W.shape[1:]), order="F")
         B[trace] = W
-        return stiffness.solve(B)[trace]
+        return solve(B)[trace]
+
+    def chunks(solve: Callable[[Array], Array]) -> Callable[[Array], Array]:
+        apply = partial(solved, solve)
+        return apply if len(equal) <= TOGETHER else partial(_in_chunks, apply)
 
     rows = [np.searchsorted(trace, own) for own in traces]
     work = 4.0 * stiffness.entries
-    chunks = apply if len(equal) <= TOGETHER else partial(_in_chunks, apply)
-    group = _group(equal, rows, len(trace), chunks, work)
-    return replace(group, stiffness=stiffness, trace=trace)
+    group = _group(equal, rows, len(trace), chunks(stiffness.solve), work)
+    rough = chunks(stiffness.roughly) if stiffness.mixed else None
+    return replace(group, stiffness=stiffness, trace=trace, rough=rough)
 
 
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
@@ -216,11 +222,17 @@ class GroupedOperator:
                 group.dense = 0.5 * A
                 if group.stiffness is not None:
                     group.stiffness.pinv_on = group.trace, group.dense
-            form = "implicit" if group.dense is None else "explicit"
+            mixed = group.rough is not None and group.dense is None
+            form = "mixed" if mixed else "implicit" if group.dense is None else "explicit"
             self.forms["shared_" * (group.columns > 1) + form] += group.count
 
-    def mult(self, w: Array, out: Array) -> None:
-        """out = diag(A_s) w, shapes ``(t,)``."""
+    @property
+    def mixed(self) -> bool:
+        """Tell whether some subdomains apply theirs to single precision for less."""
+        return self.forms["mixed"] > 0
+
+    def mult(self, w: Array, out: Array, roughly: bool = False) -> None:
+        """out = diag(A_s) w, shapes ``(t,)``; ``roughly``: to single precision where ``mixed``."""
         for group in self._groups:
-            group.mult(w, out)
+            group.mult(w, out, roughly)
         self._groups.reverse()  # what a product has read last the next one finds in the cache

@@ -43,6 +43,7 @@ from tfeti_dolfinx.subdomains.kplus import (
     regularised,
     why_indefinite,
 )
+from tfeti_dolfinx.subdomains.mixed import MixedFactor
 
 # --- The stiffness of a subdomain, or of equal ones -------------------------------------------
 
@@ -61,6 +62,7 @@ class Stiffness:
         diagonal: Diagonal of K.
         pinv_on: A trace, ascending, on which a dense K⁺ is known, maybe empty, and this.
         entries: Entries of the factor; of an inverse that the user brings, as if it were dense.
+        mixed: Whether the factor is in single precision, so that ``roughly`` costs less.
     """
 
     def __init__(self, name: str, x: Array, K: Any, how: InverseFactory) -> None:
@@ -71,6 +73,7 @@ class Stiffness:
         self.bs = self.size // max(len(x), 1)
         self._traced: WeakValueDictionary[bytes, Traced] = WeakValueDictionary()
         self.springs: Springs | None = None
+        self.mixed = False
         self.pinv_on: Any = np.empty(0, dtype=np.int32), np.empty((0, 0))
         centre = x.mean(axis=0)
         length = np.linalg.norm(x - centre, axis=1).max()
@@ -81,11 +84,15 @@ class Stiffness:
         how.factorizations += 1
         fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
-            self._pinv: GeneralisedInverse = how.kplus(K, R, fixing, how.prefix)
+            # plane ones fit into the cache, as do those that are applied to many vectors at once
+            mixed = x.shape[1] == 3 and outline(x) not in how.shared
+            self._pinv: GeneralisedInverse = how.inverse(K, R, fixing, mixed)
             self.entries = self.size**2 / 2.0
             if isinstance(self._pinv, CholeskyFactor):
                 self.entries = self._pinv.entries
-                if gives_no_energy(K, np.hstack((R, outside)), x, self._pinv):
+                self.mixed = isinstance(self._pinv, MixedFactor)
+                # single precision makes no factor of such a stiffness
+                if not self.mixed and gives_no_energy(K, np.hstack((R, outside)), x, self._pinv):
                     raise NotPositiveDefiniteError("a pivot is zero but for rounding")
         except NotPositiveDefiniteError as error:
             why = why_indefinite(K, R, outside, fixing, x, how.prefix)
@@ -101,6 +108,12 @@ class Stiffness:
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)`` or ``(n, q)``; K₁⁺ b where there are springs."""
         return self._solve(b) if self.springs is None else self.springs.without(self._solve, b)
+
+    def roughly(self, b: Array) -> Array:
+        """K⁺ b as ``solve``, to what a factor in single precision gives."""
+        assert isinstance(self._pinv, CholeskyFactor)
+        rough = self._pinv.roughly
+        return rough(b) if self.springs is None else self.springs.without(rough, b)
 
     def _solve(self, b: Array) -> Array:
         if b.ndim == 1 or isinstance(self._pinv, CholeskyFactor):
@@ -168,7 +181,7 @@ class Traced:
         Kw = self.stiffness @ w
         if self.inner is None:
             return Kw
-        return Kw - self.coupling.transposed(self.inner.solve(self.coupling @ w))
+        return Kw - self.coupling.transposed(self.inner.roughly(self.coupling @ w))
 
     def entries(self) -> Entries:
         """K_bb, that on the trace."""
@@ -200,7 +213,9 @@ class Traced:
         how.factorizations += 1
         try:
             fixing = fixing_dofs(stiffness.x, inside // stiffness.bs)
-            return regularised(K_ii.csr() if R.shape[1] else K_ii, R, fixing, how.prefix)
+            K_ii = K_ii.csr() if R.shape[1] else K_ii
+            factor = how.factor if stiffness.mixed else CholeskyFactor
+            return regularised(K_ii, R, fixing, how.prefix, factor)
         except FactorError as error:
             raise FactorError(
                 f"{stiffness.name}: the stiffness of the unknowns that no constraint touches, for "
@@ -279,6 +294,13 @@ class EqualSubdomains:
         made = Stiffness(name, x, K, self.how)
         known.add(made)
         return made, np.arange(K.shape[0], dtype=np.int32)
+
+
+def outline(x: Array) -> bytes:
+    """Number and extents of nodes, which subdomains that are equal have in common."""
+    sizes = np.ptp(x, axis=0) if len(x) else np.zeros(1)
+    digits = np.rint(sizes / (1e3 * EQUAL.place * (sizes.max() or 1.0)))
+    return np.append(digits, len(x)).astype(np.int64).tobytes()
 
 
 def places_in_order(x: Array) -> tuple[bytes, Array]:
