@@ -100,9 +100,9 @@ class Settings:
         found = equals if choice.type in ("auto", "shared") else None
         keeps = own.subdomains is not None or "soft_springs" in options.without
         equals.how.soft = 0.0 if keeps else INVERSES.weak if tangents else INVERSES.soft
-        x = dofs.points()[:, : decomposition.mesh.geometry.dim]
-        outlines = Counter(map(outline, np.split(x, dofs.node_offsets[1:-1]) if found else ()))
-        equals.how.shared = {one for one, count in outlines.items() if count > 1}
+        if equals.how.mixed and found is not None and decomposition.mesh.geometry.dim == 3:
+            outlines = Counter(map(outline, np.split(dofs.points(), dofs.node_offsets[1:-1])))
+            equals.how.shared = {one for one, count in outlines.items() if count > 1}
         make = own.block or (lambda item: SparseBlock(item, equals.how, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)

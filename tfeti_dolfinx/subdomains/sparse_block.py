@@ -85,7 +85,7 @@ class Stiffness:
         fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
             # plane ones fit into the cache, as do those that are applied to many vectors at once
-            mixed = x.shape[1] == 3 and outline(x) not in how.shared
+            mixed = how.mixed and x.shape[1] == 3 and outline(x) not in how.shared
             self._pinv: GeneralisedInverse = how.inverse(K, R, fixing, mixed)
             self.entries = self.size**2 / 2.0
             if isinstance(self._pinv, CholeskyFactor):
