@@ -457,7 +457,7 @@ class ContactProblem:
     # -------------------------------------------------------------- load steps
 
     def take_step(self, size: float) -> None:
-        """Say how long the next load step is: without inertia that many solves come is all."""
+        """Say how long the next load step is: without inertia only that steps are taken matters."""
         self._system.how.mixed = False  # single precision pays in one alone
 
     def accept(self) -> None:
