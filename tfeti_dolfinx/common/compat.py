@@ -61,7 +61,8 @@ def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: A
         lists = graph.adjacencylist(destinations, np.arange(len(cells) + 1, dtype=np.int32))
         return getattr(lists, "_cpp_object", lists)
 
-    return dmesh.create_mesh(comm, cells=cells, x=x, e=element, partitioner=stay)
+    partitioner = stay if comm.size > 1 else None  # one rank pays for none
+    return dmesh.create_mesh(comm, cells=cells, x=x, e=element, partitioner=partitioner)
 
 
 def parts_of_graph(

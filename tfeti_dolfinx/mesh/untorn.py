@@ -117,8 +117,17 @@ class UntornMesh:
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        return self.x[self.vertices].sum(axis=1) / self.vertices.shape[1]
+        corners = self.vertices.T
+        total = self.x[corners[0]]
+        for corner in corners[1:]:
+            total += self.x[corner]
+        return total / len(corners)
 
     def extents(self) -> Array:
         """Sides of each cell's box along the axes, shape ``(n, gdim)``."""
-        return np.ptp(self.x[self.vertices], axis=1)
+        low, *corners = (self.x[corner] for corner in self.vertices.T)
+        high = low.copy()
+        for x in corners:
+            np.minimum(low, x, out=low)
+            np.maximum(high, x, out=high)
+        return high - low
