@@ -73,7 +73,7 @@ class NewtonTolerances:
     last: float = 2.0
     nothing: float = 1e-12
     nowhere: float = 1e-13
-    curvature: float = 0.5
+    curvature: float = 0.3
     max_line_search: int = 12
     rounding: float = 1e-11
     shortest: float = 0.01
