@@ -10,9 +10,12 @@ from scenes import hooke, strain, tagged, vectors
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # as exact as this processor can: the assertion of the test says what that must be
 TO_ROUNDING = {"rtol": 1e-12, "error_if_not_converged": False}
+# of ``stacked``: the secondary side first
+ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]
 
 
 def boxes(cell, parts, comm=MPI.COMM_WORLD):
@@ -35,6 +38,13 @@ def boxes(cell, parts, comm=MPI.COMM_WORLD):
         cells, points = cells[:0], points[:0]
     mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element)
     return mesh, *tagged(mesh, parts)
+
+
+def sides_of(cell):
+    """Sides that hold a box on a box along their normals, so that it is pressed uniformly."""
+    flat = cell in ("triangle", "quadrilateral")
+    sides = ["lower bottom", "lower left", "upper left"]
+    return sides if flat else [*sides, "lower front", "upper front"]
 
 
 def stacked(cell, n_lower=3, n_upper=4, subdomains=4, upper=(0.0, 1.0), gap=0.0):
@@ -94,6 +104,17 @@ def sided(secondary, primary, **changes):
 def searched(contacts, dofs):
     """The conditions of contacts, as if all elements were equally stiff."""
     return ContactSearch(contacts, dofs, unit_blocks(dofs)).records
+
+
+def dofs_on(d, degree=1):
+    """Unknowns of displacements."""
+    return TornDofs(fem.functionspace(d.mesh, ("Lagrange", degree, (d.mesh.geometry.dim,))), d)
+
+
+def nodal(dofs, function):
+    """Values at the nodes of a function from (n, gdim) to (n, gdim), in primal order."""
+    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node]
+    return function(x[:, : dofs.bs]).ravel()
 
 
 def unit_blocks(dofs):

@@ -9,6 +9,7 @@ from mpi4py import MPI
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mortar.facets import group_points
 
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 SIDES_2D = {"left": (0, 0.0), "right": (0, 1.0), "bottom": (1, 0.0), "top": (1, 1.0)}
 SIDES_3D = {**SIDES_2D, "bottom": (2, 0.0), "top": (2, 1.0), "front": (1, 0.0), "back": (1, 1.0)}
 SIDES = {2: SIDES_2D, 3: SIDES_3D}
@@ -51,6 +52,16 @@ def box(cell="hexahedron", n=3, comm=MPI.COMM_WORLD, degree_of_grading=1.0):
 def decomposed(cell="hexahedron", n=3, subdomains=4, comm=MPI.COMM_WORLD, grading=1.0):
     mesh, facet_tags, names = box(cell, n, comm, grading)
     return tfeti.decompose(mesh, subdomains, facet_tags=facet_tags, surfaces=names)
+
+
+def grid(n):
+    """Subdomains of a unit square or cube, n along each axis."""
+
+    def subdomain(x):
+        i, j, k = np.minimum((n * x).astype(int), n - 1)
+        return i + n * j + n * n * k
+
+    return subdomain
 
 
 def strain(u):

@@ -34,20 +34,13 @@ from tfeti_dolfinx.testing import check_block
 ALL = tfeti.BoundaryElements()
 
 
-def made_parts(d, K=None):
-    """All subdomains of this rank with boundary elements."""
-    V, a, _ = forms(d.mesh, d.facet_tags, (0.0,) * d.mesh.geometry.dim, d.surface("top"))
-    dofs, how = TornDofs(V, d), InverseFactory()
-    parts = Parts(dofs, d, np.ones(len(d.subdomains), dtype=bool), how)
-    K = assemble_csr(fem.form(a)) if K is None else K
-    parts.take_stiffness(K, node_blocks(K, dofs.bs)[dofs.dolfinx_node])
-    return parts, dofs, K, how
-
-
 @pytest.mark.parametrize(("cell", "n"), [("triangle", 6), ("hexahedron", 2)])
 def test_blocks_keep_their_promises(cell, n):
     d = decomposed(cell, n, 2)
-    parts, dofs, K, how = made_parts(d)
+    V, a, _ = forms(d.mesh, d.facet_tags, (0.0,) * d.mesh.geometry.dim, d.surface("top"))
+    dofs, K = TornDofs(V, d), assemble_csr(fem.form(a))
+    parts = Parts(dofs, d, np.ones(len(d.subdomains), dtype=bool), InverseFactory())
+    parts.take_stiffness(K, node_blocks(K, dofs.bs)[dofs.dolfinx_node])
     trace = np.concatenate(
         [np.empty(0, dtype=np.int64)]
         + [parts._unknowns(s).start + np.flatnonzero(p.on_surface) for s, p in parts.parts.items()]

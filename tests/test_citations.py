@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from quick_demos import alone, process
 
-import tfeti_dolfinx
 from tfeti_dolfinx.common.logging import PAPERS, entry
 from tfeti_dolfinx.qp.solvers import SOLVERS
 
@@ -51,10 +50,8 @@ def test_all_solvers_have_papers_that_are_whole():
                 assert f"{field} = {{" in paper
 
 
-def test_versions_and_papers_agree_with_those_of_the_package():
-    recipe = (ROOT / "environment/conda/recipe.yaml").read_text()
+def test_the_package_s_citation_has_all_papers():
+    """Its version is looked at in test_docs."""
     cited = (ROOT / "CITATION.cff").read_text()
-    assert f'version: "{tfeti_dolfinx.__version__}"' in recipe
-    assert f"version: {tfeti_dolfinx.__version__}" in cited
     papers = {key for keys in PAPERS.values() for key in keys}
     assert cited.count("  - type: ") == len(papers)

@@ -5,23 +5,13 @@ import pytest
 import ufl
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
-from scenes import apart, curved_obstacle, decomposed, hooke, problem, strain
+from scenes import apart, curved_obstacle, decomposed, grid, hooke, problem, strain
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, Saddle
 from tfeti_dolfinx.errors import FactorError, InputError
 
 COMM = MPI.COMM_WORLD
-
-
-def grid(n):
-    """Subdomains of a unit square or cube, n along each axis."""
-
-    def subdomain(x):
-        i, j, k = np.minimum((n * x).astype(int), n - 1)
-        return i + n * j + n * n * k
-
-    return subdomain
 
 
 def square(cells=16, parts=4, cell="quadrilateral", **options):

@@ -6,11 +6,19 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from reference.untorn import on_plane, untorn_box
-from scenes import curved_obstacle, decomposed, displacement, hooke, problem, relative, strain
+from scenes import (
+    CELLS,
+    curved_obstacle,
+    decomposed,
+    displacement,
+    hooke,
+    problem,
+    relative,
+    strain,
+)
 
 import tfeti_dolfinx as tfeti
 
-CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 SMALSE = {"tfeti_qp_type": "smalse"}
 
 

@@ -2,23 +2,14 @@
 
 import numpy as np
 import pytest
-from bodies import boxes, gathered, searched, sided, stacked
-from dolfinx import fem
+from bodies import ORDERS, boxes, dofs_on, gathered, searched, sided, stacked
 from mpi4py import MPI
-from scenes import decomposed, problem
+from scenes import CELLS, decomposed, problem
 from true_errors import OVERLAP, ring_problem
 
 import tfeti_dolfinx as tfeti
 from meshes.rings import lame_pressure
-from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import group_points
-
-CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
-ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]
-
-
-def dofs_of(d):
-    return TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (d.mesh.geometry.dim,))), d)
 
 
 def shaped(cell, n_lower, n_upper, lower, upper, across=(0.0, 1.0)):
@@ -60,7 +51,7 @@ def bent(cell, n_lower, n_upper, lower, upper):
 def test_bodies_that_only_touch_have_no_overlap(cell, n, curvatures, sides):
     """Flat, convex and concave sides; a mean with ψ_i, negative somewhere, must not say more."""
     d = bent(cell, *n, *curvatures)
-    gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_of(d)).gap)
+    gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_on(d)).gap)
     assert len(gaps) > 0
     assert gaps.min() > -1e-12
 
@@ -74,7 +65,7 @@ def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
         d.mesh.geometry.x[:, 0] = size * (np.cos(0.3) * x - np.sin(0.3) * y)
         d.mesh.geometry.x[:, 1] = size * (np.sin(0.3) * x + np.cos(0.3) * y)
         for sides in ORDERS:
-            gaps = gathered(searched([sided(*sides)], dofs_of(d)).gap)
+            gaps = gathered(searched([sided(*sides)], dofs_on(d)).gap)
             assert len(gaps) > 0
             assert np.allclose(gaps, gap * size, rtol=1e-2, atol=0.0)
 
@@ -94,7 +85,7 @@ def test_an_overhanging_wedge(cell, slope):
     d = shaped(
         cell, 3, n, lambda x: 0.0 * x[:, 0], lambda x: slope * (x[:, 0] - start), across=(0.0, 1.15)
     )
-    dofs = dofs_of(d)
+    dofs = dofs_on(d)
     records = searched([sided(*ORDERS[0], reach=0.5)], dofs)
     x = gathered(group_points(dofs)[records.group])[:, 0] - 0.5
     gaps, expected = gathered(records.gap), slope * (x - start)
@@ -160,7 +151,7 @@ def test_the_gap_of_an_obstacle_is_what_is_given():
 def test_the_gap_of_a_pair_is_what_is_given():
     """Also where the meshes overlap by more than the reach."""
     d = stacked("triangle", 3, 4, 4, gap=-0.1)
-    dofs = dofs_of(d)
+    dofs = dofs_on(d)
     records = searched([sided(*ORDERS[0], gap=lambda x: x[0] - 0.5)], dofs)
     x = group_points(dofs)[records.group]
     assert np.allclose(records.gap, x[:, 0] - 0.5)

@@ -2,7 +2,16 @@
 
 import numpy as np
 import pytest
-from bodies import gathered, held, pressed, sided, stacked, stiffer_above, two_body_problem
+from bodies import (
+    gathered,
+    held,
+    pressed,
+    sided,
+    sides_of,
+    stacked,
+    stiffer_above,
+    two_body_problem,
+)
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
@@ -15,11 +24,7 @@ def scene(
 ):
     """A box on a box, n = (cells of the lower, of the upper); the upper one is stiffer."""
     d = stacked(cell, *n, subdomains)
-    gdim = d.mesh.geometry.dim
-    stress = stiffer_above(d, stiffness)
-    sides = ["lower bottom", "lower left", "upper left"]
-    sides += ["lower front", "upper front"] if gdim == 3 else []
-    bcs = held(d, *sides)
+    stress, bcs = stiffer_above(d, stiffness), held(d, *sides_of(cell))
     p = two_body_problem(d, pressed(d), bcs, [contact], degree, stress=stress, **options)
     p.solve()
     return p

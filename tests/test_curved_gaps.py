@@ -5,11 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 import ufl
-from bodies import gathered, searched, sided
+from bodies import ORDERS, dofs_on, gathered, searched, sided
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import clamp
-from test_contact_gaps import CELLS, ORDERS, dofs_of, shaped
+from scenes import CELLS, clamp
+from test_contact_gaps import shaped
 from test_mortar_cases import no_load
 
 import tfeti_dolfinx as tfeti
@@ -136,7 +136,7 @@ def height(x):
 def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
     """Both have the same shape, 0.01 apart: at rims, in corners, and however coarse they are."""
     d = shaped(cell, 3, 5, height, lambda x: height(x) + 0.01)
-    dofs = dofs_of(d)
+    dofs = dofs_on(d)
     flat, curved = (
         searched([sided(*sides, reach=0.5, gap=gap)], dofs) for gap in ("geometry", "curved")
     )
@@ -150,7 +150,7 @@ def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
 def test_edges_are_not_rounded_off(cell, sides):
     """A roof of 90 degrees in another."""
     d = shaped(cell, 4, 6, lambda x: -np.abs(x[:, 0]), lambda x: 0.01 - np.abs(x[:, 0]))
-    dofs = dofs_of(d)
+    dofs = dofs_on(d)
     found = [
         gathered(searched([sided(*sides, reach=0.5, gap=gap)], dofs).gap)
         for gap in ("geometry", "curved")

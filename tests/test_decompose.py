@@ -9,13 +9,11 @@ from dolfinx import mesh as dmesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
-from scenes import SIDES, box, decomposed, integral, measures
+from scenes import CELLS, SIDES, box, decomposed, integral, measures
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mesh.tearing import deal
-
-CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
 
 def cells_of(decomposition):

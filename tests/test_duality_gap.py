@@ -7,12 +7,11 @@ import pytest
 import ufl
 from bodies import held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
-from scenes import curved_obstacle, decomposed, problem
+from scenes import CELLS, curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.solve.solver import solve_dual
 
-CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 LAWS = (
     None,
     lambda rng: tfeti.Tresca(10.0 ** rng.uniform(-4, -2)),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import held, pressed, stacked, two_body_problem
+from bodies import gathered, held, pressed, stacked, two_body_problem
 from scenes import decomposed, problem
 from test_qp import matrix, random_program, vector
 from test_solvable_lp import dual_of
@@ -72,11 +72,6 @@ FACES = {
 }
 
 
-def gathered(dual, rows):
-    """Rows of all ranks, dense."""
-    return np.concatenate(dual.coarse.comm.allgather(np.asarray(rows)))
-
-
 @pytest.mark.parametrize("kind", list(FACES))
 def test_projectors_of_a_face(dual, kind):
     """P is idempotent, symmetric, kills Z G_fᵀ and what is not in Z, and is the dense one."""
@@ -92,11 +87,11 @@ def test_projectors_of_a_face(dual, kind):
     assert np.allclose(Px + Qx, face.restricted(x), atol=1e-9)
     y = coarse.combined(np.random.default_rng(0).standard_normal(dual.coarse.dimension))
     assert norm_over(comm, coarse.project(y)) <= 1e-9 * norm_over(comm, y)
-    Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
+    Gt = gathered(face.restricted(dual.coarse.Gt.toarray()))
     U, values, _ = np.linalg.svd(Gt, full_matrices=False)
     U = U[:, values > 1e-9 * values[0]]
-    masked = gathered(dual, face.restricted(x))
-    assert np.allclose(gathered(dual, Px), masked - U @ (U.T @ masked), atol=1e-8)
+    masked = gathered(face.restricted(x))
+    assert np.allclose(gathered(Px), masked - U @ (U.T @ masked), atol=1e-8)
 
 
 @pytest.mark.parametrize("kind", list(FACES))
@@ -107,7 +102,7 @@ def test_the_particular_solution_of_a_face(dual, kind):
     lam = coarse.particular()
     assert np.allclose(face.restricted(lam), lam)
     left = dual.coarse.e - dual.coarse.G(lam)
-    Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
+    Gt = gathered(face.restricted(dual.coarse.Gt.toarray()))
     rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
     if rank == dual.coarse.dimension - dual.coarse.free_motions.count:
         assert np.linalg.norm(left) <= 1e-9 * np.linalg.norm(dual.coarse.e)

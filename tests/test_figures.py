@@ -26,17 +26,12 @@ PETSC = PETSc.Sys.getVersion()
 LENGTHS, PRESSURES = zip(*UNITS[1:], strict=True)
 
 
-def rows_of(benchmark, first):
-    """Rows of the tables that a benchmark has written into a page, by their first cell."""
-    text = (ROOT / "docs/developers/performance.md").read_text()
-    tables = re.findall(rf"^<!-- {benchmark}: .*? -->\n(.*?)^<!-- end -->", text, re.S | re.M)
-    rows = [[cell.strip() for cell in row.split("|")] for row in "".join(tables).splitlines()]
-    return [row[1:-1] for row in rows if row[1:2] == [first]]
-
-
 def of_contact(column):
     """What contact by block Newton has in a column of the price of contact: least and most."""
-    cube, ball = (float(row[column]) for row in rows_of("linear_price", "contact, newton"))
+    text = (ROOT / "docs/developers/performance.md").read_text()
+    tables = re.findall(r"^<!-- linear_price: .*? -->\n(.*?)^<!-- end -->", text, re.S | re.M)
+    rows = [[cell.strip() for cell in row.split("|")] for row in "".join(tables).splitlines()]
+    cube, ball = (float(row[1:-1][column]) for row in rows if row[1:2] == ["contact, newton"])
     return [round(found, 1) for found in sorted((cube, ball))]
 
 

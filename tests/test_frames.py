@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import gathered, searched, sided, stacked
+from bodies import ORDERS, dofs_on, gathered, nodal, searched, sided, stacked
 from dolfinx import fem
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,8 +18,6 @@ from tfeti_dolfinx.mortar.facets import group_points
 from tfeti_dolfinx.mortar.segments import frames
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
-ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]
-
 
 def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -30,17 +28,6 @@ def simple_normals(gdim):
     steps = np.arange(-4, 5)
     grid = np.stack(np.meshgrid(*[steps] * gdim), axis=-1).reshape(-1, gdim)
     return unit(grid[np.any(grid != 0, axis=1)])
-
-
-def dofs_on(d, degree=1):
-    gdim = d.mesh.geometry.dim
-    return TornDofs(fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,))), d)
-
-
-def nodal(dofs, function):
-    """Values at the nodes of a function from (n, gdim) to (n, gdim), in primal order."""
-    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node]
-    return function(x[:, : dofs.bs]).ravel()
 
 
 @given(st.integers(1, 3), st.integers(0, 1000))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bodies import dofs_on, gathered, nodal
 from dolfinx import fem
 from scenes import clamp, curved_obstacle, decomposed
 from scipy.sparse import csr_array
@@ -9,7 +10,6 @@ from scipy.sparse import csr_array
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.records import concatenate
-from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
 class Scene:
@@ -18,44 +18,34 @@ class Scene:
     def __init__(self, cell="hexahedron", n=4, degree=1, clamped=True, contacts=(), weights=None):
         self.d = d = decomposed(cell, n, subdomains=lambda x: (x[0] > 0.5) + 2 * (x[1] > 0.5))
         gdim = d.mesh.geometry.dim
-        self.V = V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
-        self.dofs = dofs = TornDofs(V, d)
-        self.bcs = []
-        if clamped:
-            self.bcs = [clamp(V, d.facets("left"), np.arange(1.0, gdim + 1))]
+        self.dofs = dofs = dofs_on(d, degree)
+        bcs = [clamp(dofs.V, d.facets("left"), np.arange(1.0, gdim + 1))] if clamped else []
         found = [c.records(dofs, i, np.inf, np.inf) for i, c in enumerate(contacts)]
         records = concatenate(found, gdim)
         n_local = dofs.num_nodes * dofs.bs
         self.weights = np.ones(n_local) if weights is None else weights(dofs)
-        self.gluing = glue(dofs, prescribe(dofs, self.bcs), records, 1.0, self.weights)
+        self.gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, self.weights)
         self.constraints = self.gluing.constraints
 
     @property
     def B(self):
         indptr, indices, data = self.constraints.B.getValuesCSR()
         m, n = len(indptr) - 1, self.constraints.B.getSize()[1]
-        rows = self.d.comm.allgather(csr_array((data, indices, indptr), shape=(m, n)).toarray())
-        return np.concatenate(rows)
+        return gathered(csr_array((data, indices, indptr), shape=(m, n)).toarray())
 
     def trace(self, values):
         """Trace values of all ranks from primal values."""
-        return np.concatenate(self.d.comm.allgather(values[self.constraints.trace]))
+        return gathered(values[self.constraints.trace])
 
     def rows(self, name):
         """Flags of a named set among all ranks' rows."""
-        sets = self.constraints.sets
         flags = np.zeros(self.constraints.num_rows, dtype=bool)
-        flags[getattr(sets, name)] = True
-        return np.concatenate(self.d.comm.allgather(flags))
-
-    def nodal(self, function):
-        """Primal values of a function of points of shape (n, 3)."""
-        x = self.V.tabulate_dof_coordinates()[self.dofs.dolfinx_node]
-        return function(x)[:, : self.dofs.bs].ravel()
+        flags[getattr(self.constraints.sets, name)] = True
+        return gathered(flags)
 
     @property
     def rhs(self):
-        return np.concatenate(self.d.comm.allgather(np.array(self.constraints.c)))
+        return gathered(np.array(self.constraints.c))
 
 
 @pytest.mark.parametrize(
@@ -85,7 +75,7 @@ def test_rows_are_orthonormal_in_the_inner_product_of_the_stiffness():
 def test_gluing_rows_are_as_many_as_there_are_jumps_and_blind_to_continuous_fields():
     scene = Scene(clamped=False)
     A = np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9]])
-    assert np.abs(scene.B @ scene.trace(scene.nodal(lambda x: np.sin(x @ A)))).max() <= 1e-12
+    assert np.abs(scene.B @ scene.trace(nodal(scene.dofs, lambda x: np.sin(x @ A)))).max() <= 1e-12
     dofs = scene.dofs
     jumps = dofs.comm.allreduce(int(np.sum(dofs.multiplicity - 1))) * dofs.bs
     assert len(scene.B) == jumps
@@ -94,10 +84,10 @@ def test_gluing_rows_are_as_many_as_there_are_jumps_and_blind_to_continuous_fiel
 
 def test_dirichlet_rows_hold_every_copy_with_its_value():
     scene = Scene()
-    u = scene.nodal(lambda x: np.broadcast_to([1.0, 2.0, 3.0], x.shape))
+    u = nodal(scene.dofs, lambda x: np.broadcast_to([1.0, 2.0, 3.0], x.shape))
     assert np.allclose(scene.B @ scene.trace(u), scene.rhs, atol=1e-13)
     dofs = scene.dofs
-    left = scene.nodal(lambda x: np.isclose(x, 0.0)[:, [0, 0, 0]])
+    left = nodal(scene.dofs, lambda x: np.isclose(x, 0.0)[:, [0, 0, 0]])
     held = np.sum(left)
     ones = np.sum(np.isclose(np.abs(scene.B).max(axis=1), 1.0, rtol=1e-12))
     assert ones == dofs.comm.allreduce(int(held))
@@ -105,8 +95,8 @@ def test_dirichlet_rows_hold_every_copy_with_its_value():
 
 def test_a_dirichlet_value_reaches_copies_that_have_no_facet_on_the_surface():
     d = decomposed("triangle", 2, subdomains=lambda x: np.arange(x.shape[1]))
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    dofs = TornDofs(V, d)
+    dofs = dofs_on(d)
+    V = dofs.V
     left = fem.locate_dofs_topological(V.sub(1), 1, d.facets("left"))
     records = concatenate([], 2)
     ones = np.ones(dofs.num_nodes * 2)
@@ -134,9 +124,9 @@ def test_contact_rows_measure_the_approach_in_scaled_lengths():
     plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.1), (0, 0, 2)))
     scene = Scene(contacts=[plane], clamped=False)
     rows = scene.rows("normals")
-    u = scene.trace(scene.nodal(lambda x: np.column_stack((x[:, 0], x[:, 1], -0.3 - x[:, 0]))))
-    scale = np.concatenate(scene.d.comm.allgather(scene.gluing.contact.scale))
-    approach = (scene.B @ u)[rows] / scale
+    u = nodal(scene.dofs, lambda x: np.column_stack((x[:, 0], x[:, 1], -0.3 - x[:, 0])))
+    scale = gathered(scene.gluing.contact.scale)
+    approach = (scene.B @ scene.trace(u))[rows] / scale
     assert np.allclose(scene.rhs[rows] / scale, 0.1)
     assert approach.min() == pytest.approx(0.3)
     assert approach.max() == pytest.approx(1.3)
@@ -145,8 +135,8 @@ def test_contact_rows_measure_the_approach_in_scaled_lengths():
 def test_prescribed_components_move_into_the_gap():
     slanted = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (3, 0, 4)))
     d = decomposed("hexahedron", 2, 2)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    dofs = TornDofs(V, d)
+    dofs = dofs_on(d)
+    V = dofs.V
     bottom = fem.locate_dofs_topological(V.sub(0), 2, d.facets("bottom"))
     records = concatenate([slanted.records(dofs, 0, np.inf, np.inf)], 3)
     bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]

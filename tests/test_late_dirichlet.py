@@ -15,16 +15,14 @@ from tfeti_dolfinx.subdomains import sparse_block
 SUBDOMAINS = 4
 
 
-def block(contact=True, n=4, **options):
-    """A clamped block of subdomains that do not share their factors."""
+def solved(contact=True, n=4, **options):
+    """Solver, factorisations of a subdomain, multiplications by S and displacement.
+
+    Of a clamped block of subdomains that do not share their factors.
+    """
     obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.2)] if contact else []
     d = decomposed("hexahedron", n, SUBDOMAINS)
-    return problem(d, contacts=obstacles, tfeti_local_type="implicit", **options)
-
-
-def solved(*given, **options):
-    """Solver, factorisations of a subdomain, multiplications by S and displacement of a block."""
-    p = block(*given, **options)
+    p = problem(d, contacts=obstacles, tfeti_local_type="implicit", **options)
     p.solve()
     report, u = p.report, p.solution.u
     p.destroy()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mpi4py import MPI
-from scenes import apart, box, curved_obstacle, decomposed, problem
+from scenes import apart, curved_obstacle, decomposed, grid, problem
 from scipy.sparse import csr_array
 from test_blocks import data, stiffness
 from test_dual import check_operator
@@ -16,18 +16,6 @@ from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.testing import check_block, check_kind_of_block
 
 KINDS = ("pinv", "stiffness", "schur")
-
-
-def cubes(cell, parts=2, cells=2):
-    """A box whose subdomains are equal boxes, in rows of so many."""
-    mesh, facet_tags, names = box(cell, parts * cells)
-    gdim = mesh.geometry.dim
-
-    def subdomain(x):
-        index = np.minimum((x[:gdim] * parts).astype(int), parts - 1)
-        return parts ** np.arange(gdim) @ index
-
-    return tfeti.decompose(mesh, subdomain, facet_tags=facet_tags, surfaces=names)
 
 
 def made(d, local_type="auto", contact=True, **options):
@@ -59,11 +47,6 @@ def blockwise(blocks, kind, w):
     return out
 
 
-def close(x, y):
-    """Whether arrays agree to 1e-10 of the largest entry of all ranks."""
-    return apart(x, y) <= 1e-10
-
-
 @pytest.mark.parametrize(
     ("cell", "equal"), [("triangle", False), ("quadrilateral", True), ("hexahedron", False)]
 )
@@ -73,7 +56,7 @@ def test_all_forms_apply_the_same(cell, equal):
     K⁺ is compared on forces that are in balance: generalised inverses of a place of its own each
     differ by rigid motions. S from a dense K⁺ is that through K_ii, which is made before.
     """
-    d = cubes(cell) if equal else decomposed(cell, 4, 5)
+    d = decomposed(cell, 4, grid(2) if equal else 5)
     p, subdomains = made(d)
     alone, single = made(d, "implicit")
     w = random(len(subdomains.trace))
@@ -84,23 +67,23 @@ def test_all_forms_apply_the_same(cell, equal):
             expected = blockwise(s.blocks, kind, w)
             for form in ("implicit", "explicit"):
                 operator = GroupedOperator(s.blocks, kind, LocalChoice(form))
-                assert close(applied(operator, w), expected)
+                assert apart(applied(operator, w), expected) <= 1e-10
     explicit, dense = made(d, "explicit")
     traced = [block.traced for block in dense.blocks]
     known = all(t.schur is not None for t in traced if len(t.inside) and len(t.trace))
     assert d.comm.allreduce(known, op=MPI.LAND)
-    assert close(applied(dense.local_operator("schur"), w), applied(through_inside, w))
+    assert apart(applied(dense.local_operator("schur"), w), applied(through_inside, w)) <= 1e-10
     R = subdomains.kernel_rows.toarray()
     balanced = w - R @ np.linalg.lstsq(R, w, rcond=None)[0]
     u, v = (applied(s.local_operator("pinv"), balanced) for s in (subdomains, single))
-    assert close(balanced @ u, balanced @ v)
+    assert apart(balanced @ u, balanced @ v) <= 1e-10
     check_operator(p.dual.F, d.comm, len(p.dual.d))
     for item in (p, alone, explicit):
         item.destroy()
 
 
 def test_equal_subdomains_are_factored_once():
-    d = cubes("tetrahedron")
+    d = decomposed("tetrahedron", 4, grid(2))
     p, subdomains = made(d, "shared", tfeti_pc_type="lumped")
     ranks_with_any = d.comm.allreduce(int(len(d.subdomains) > 0))
     assert d.comm.allreduce(p._system.how.factorizations) == ranks_with_any
@@ -121,7 +104,7 @@ def test_equal_subdomains_are_factored_once():
 def test_the_answer_does_not_depend_on_the_form(local_type, contact):
     u, reports = [], []
     for name in ("implicit", local_type):
-        d = cubes("hexahedron")
+        d = decomposed("hexahedron", 4, grid(2))
         contacts = [tfeti.Obstacle("bottom", curved_obstacle(3))] if contact else []
         p = problem(d, contacts=contacts, tfeti_local_type=name, tfeti_rtol=1e-9)
         u.append(p.solve().x.array.copy())

@@ -8,6 +8,7 @@ import ufl
 from bodies import (
     TO_ROUNDING,
     boxes,
+    dofs_on,
     gathered,
     held,
     jagged,
@@ -17,16 +18,13 @@ from bodies import (
     stacked,
     two_body_problem,
 )
-from dolfinx import fem
 from mpi4py import MPI
 from reference import mortar
-from scenes import clamp, displacement, relative
+from scenes import CELLS, clamp, displacement, relative
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import NoSolutionError
-from tfeti_dolfinx.mesh.dofs import TornDofs
 
-CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 PAIR = sided("upper bottom", "lower top")
 
 
@@ -58,8 +56,7 @@ def lever(cell, subdomains=4, n=(3, 4), contact=PAIR, gap=0.0, **options):
 @pytest.mark.parametrize("cell", CELLS)
 def test_matching_meshes_give_node_to_node_rows(cell):
     d = stacked(cell, 3, 3, 4)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (d.mesh.geometry.dim,)))
-    dofs = TornDofs(V, d)
+    dofs = dofs_on(d)
     records = searched([PAIR], dofs)
     order = np.argsort(records.condition, kind="stable")
     assert np.array_equal(records.condition[order], np.repeat(np.arange(len(records)), 2))
@@ -81,8 +78,7 @@ def test_flat_sides_far_from_the_origin_have_exact_normals(cell):
     d = stacked(cell, 3, 4, 4)
     gdim = d.mesh.geometry.dim
     d.mesh.geometry.x[:, gdim - 1] += 172790.7
-    dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,))), d)
-    records = searched([PAIR], dofs)
+    records = searched([PAIR], dofs_on(d))
     assert np.all(np.abs(records.normal[:, : gdim - 1]) <= 1e-15)
     assert total(len(records)) > 0
 

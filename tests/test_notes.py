@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from bodies import held, pressed, sided, stacked, two_body_problem
+from bodies import held, pressed, sided, sides_of, stacked, two_body_problem
 from scenes import decomposed, problem
 
 import tfeti_dolfinx as tfeti
@@ -59,11 +59,9 @@ def test_pressures_of_nodes_that_are_hardly_covered(cell, beyond, secondary, exp
     """A block whose edge is a little beyond a node of the face on which it is pressed."""
     width, gap = (1.0 + beyond) / 3.0, -0.02 if beyond > 0.1 else 0.0
     d = stacked(cell, 3, 4, 4, upper=(0.0, width), gap=gap)
-    sides = ["lower bottom", "lower left", "upper left"]
-    sides += ["lower front", "upper front"] if cell == "hexahedron" else []
     primary = {"lower top": "upper bottom", "upper bottom": "lower top"}[secondary]
     contact = sided(secondary, primary, name="faces")
-    p = two_body_problem(d, pressed(d, 0.1), held(d, *sides), [contact])
+    p = two_body_problem(d, pressed(d, 0.1), held(d, *sides_of(cell)), [contact])
     p.solve()
     found = [note for note in p.report.notes if note.startswith("faces: pressures go up to")]
     (summary,) = p.report.contacts

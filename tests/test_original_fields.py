@@ -7,12 +7,11 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import box, clamp, forms, integral, largest
+from scenes import CELLS, box, clamp, forms, integral, largest
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.compat import interpolation_points
 
-CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 KINDS = {
     "P1": ("Lagrange", 1, ()),
     "P2 tensor": ("Lagrange", 2, (2, 2)),

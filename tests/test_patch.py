@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from bodies import (
+    ORDERS,
     TO_ROUNDING,
     boxes,
     gathered,
@@ -10,6 +11,7 @@ from bodies import (
     jagged,
     pressed,
     sided,
+    sides_of,
     stacked,
     two_body_problem,
 )
@@ -19,12 +21,6 @@ from scenes import clamp, largest
 import tfeti_dolfinx as tfeti
 
 PRESSURE = 0.1
-
-
-def sides_of(cell):
-    flat = cell in ("triangle", "quadrilateral")
-    sides = ["lower bottom", "lower left", "upper left"]
-    return sides if flat else [*sides, "lower front", "upper front"]
 
 
 def linear_displacement(x, gdim, E=1.0, nu=0.3):
@@ -48,11 +44,7 @@ def error_of_displacement(problem):
 
 
 def pressures(problem):
-    data = problem.solution.contact()
-    return gathered(data.pressure)
-
-
-ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]
+    return gathered(problem.solution.contact().pressure)
 
 
 def wavy(d):
@@ -180,10 +172,8 @@ def test_overhanging_secondary_side(cell, subdomains, share):
         ends = pressed(d, PRESSURE)(v, ds)
         return ends + q * v[gdim - 1] * ds(d.surface("upper bottom"))
 
-    sides = sides_of(cell)
-    problem = two_body_problem(
-        d, load, held(d, *sides), [sided("upper bottom", "lower top")], **TO_ROUNDING
-    )
+    pair = sided("upper bottom", "lower top")
+    problem = two_body_problem(d, load, held(d, *sides_of(cell)), [pair], **TO_ROUNDING)
     problem.solve()
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
 

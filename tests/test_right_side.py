@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies import searched, sided, stacked, unit_blocks
+from bodies import dofs_on, searched, sided, stacked, unit_blocks
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import clamp, decomposed
@@ -11,7 +11,6 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.errors import InputError, NoSolutionError
-from tfeti_dolfinx.mesh.dofs import TornDofs
 
 PAIR = sided("upper bottom", "lower top", reach=0.5)
 
@@ -22,8 +21,7 @@ class Scene:
     def __init__(self, cell="tetrahedron", degree=1):
         self.d = d = stacked(cell, 3, 4, 6)
         gdim = d.mesh.geometry.dim
-        self.V = V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
-        self.dofs = TornDofs(V, d)
+        self.dofs = dofs_on(d, degree)
         up = np.eye(gdim)[-1] + 0.3 * np.eye(gdim)[0]
         plane = tfeti.Plane(tuple(-1.1 * np.eye(gdim)[-1]), tuple(up))
         contacts = [PAIR, tfeti.Obstacle("lower bottom", plane, reach=np.inf)]
@@ -32,7 +30,7 @@ class Scene:
 
     def bcs(self, side, across, top):
         """Values: of the x component at a side, of the last at the lower box's right, on top."""
-        V, d, last = self.V, self.d, self.V.mesh.geometry.dim - 1
+        V, d, last = self.dofs.V, self.d, self.dofs.bs - 1
         fdim = d.mesh.topology.dim - 1
         made = []
         for name, axis, value in (("lower left", 0, side), ("lower right", last, across)):
@@ -77,11 +75,10 @@ def test_other_values_and_gaps_cost_a_vector(cell, degree):
 
 def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
     d = decomposed("hexahedron", 3, 4)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    dofs = TornDofs(V, d)
+    dofs = dofs_on(d)
     wall = tfeti.Obstacle("left", tfeti.Plane((-0.5, 0, 0), (1, 0, 0)))
     records = searched([wall], dofs)
-    held, ones = prescribe(dofs, [clamp(V, d.facets("left"))]), np.ones(dofs.num_nodes * 3)
+    held, ones = prescribe(dofs, [clamp(dofs.V, d.facets("left"))]), np.ones(dofs.num_nodes * 3)
     gluing = glue(dofs, held, records, 1.0, ones)
     assert d.comm.allreduce(len(gluing.contact.decided)) == 0
     near = glue(
@@ -125,7 +122,7 @@ def test_another_gap_is_that_of_a_search():
 
 def test_a_geometry_that_overlaps_too_deep_is_not_gone_back_to():
     d = stacked("triangle", 3, 4, 4, gap=-0.1)
-    dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
+    dofs = dofs_on(d)
     pair = sided("upper bottom", "lower top", gap=0.0)
     search = ContactSearch([pair], dofs, unit_blocks(dofs))
     with pytest.raises(InputError, match=r"the surfaces overlap by up to 0\.1, more than"):

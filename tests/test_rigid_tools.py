@@ -440,8 +440,7 @@ def test_a_body_that_was_pushed_stays_when_tools_go_back(reach, weight, finite):
     problem = tfeti.NonlinearContactProblem(F, u, [], tools, decomposition, finite=finite)
     for right, up, x, y in ((0.5, 0, 0.5, 0), (1, 0, 1, 0), (0.8, 0.2, 1, 0.2), (0, 0, 1, 0.2)):
         ways[0].value[0], ways[1].value[1] = right, up
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         assert np.allclose(u.x.array.reshape(-1, 2), (x, up if weight else y), atol=0.02)
 
 
@@ -487,8 +486,7 @@ def test_a_free_body_that_friction_has_held_is_let_go():
                 problem.restore(states[begin - 1])
             for t in range(begin, 4):
                 problem.time = float(t)
-                problem.solve()
-                problem.accept()
+                accepted(problem)
                 states[t] = problem.state()
                 forces = [problem.solution.contact(i).resultant.force for i in (0, 1)]
                 assert largest(np.add(*forces)) <= 1e-9
@@ -513,8 +511,7 @@ def test_what_jaws_have_carried_stays_where_they_let_it_go():
     small = tfeti.ContactProblem(a, ufl.ZeroBaseForm((v,)), [], jaws, d, petsc_options=TIGHT)
     for problem in (small, tfeti.NonlinearContactProblem(F, w, [], jaws, d, finite=True)):
         for problem.time in range(3):
-            problem.solve()
-            problem.accept()
+            accepted(problem)
         assert apart(problem.u.x.array.reshape(-1, 3), [[0, 0.05, 0]]) <= 0.02
         assert problem.report.F_multiplications <= 60
 

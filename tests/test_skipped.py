@@ -15,13 +15,6 @@ import tfeti_dolfinx as tfeti
 SUBDOMAINS = 8
 
 
-def cube(contact, **options):
-    """A clamped cube of equal subdomains that do not share their factors."""
-    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))] if contact else []
-    d = decomposed("hexahedron", 4, SUBDOMAINS)
-    return problem(d, contacts=obstacles, tfeti_local_type="implicit", **options)
-
-
 @pytest.mark.parametrize(
     ("contact", "qp_type", "pc_type", "factors"),
     [
@@ -33,7 +26,10 @@ def cube(contact, **options):
     ],
 )
 def test_only_the_dirichlet_preconditioner_factors_K_ii(contact, qp_type, pc_type, factors):
-    p = cube(contact, tfeti_qp_type=qp_type, tfeti_pc_type=pc_type)
+    """Of equal subdomains that do not share their factors."""
+    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))] if contact else []
+    options = {"local_type": "implicit", "qp_type": qp_type, "pc_type": pc_type}
+    p = problem(decomposed("hexahedron", 4, SUBDOMAINS), contacts=obstacles, **options)
     p.solve()
     assert p.report.factorizations == factors * SUBDOMAINS
     assert (p.report.preconditioner_multiplications == 0) == (pc_type in ("none", "auto"))

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scenes import curved_obstacle, decomposed, displacement, largest, problem
+from scenes import curved_obstacle, decomposed, displacement, grid, largest, problem
+from test_clusters import solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.subdomains.block import Springs
@@ -10,26 +11,17 @@ from tfeti_dolfinx.subdomains.block import Springs
 SUBDOMAINS = 8
 
 
-def cubes(x):
-    """Eight subdomains."""
-    i, j, k = np.minimum((2 * x).astype(int), 1)
-    return i + 2 * j + 4 * k
-
-
 def foundation(stiffness, contact=True, **options):
     """A block of 8 cubes, clamped on the left, with springs in each of its points."""
     obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.2)] if contact else []
-    d = decomposed("hexahedron", 6, cubes)
+    d = decomposed("hexahedron", 6, grid(2))
     return problem(d, (0.0, 0.0, -0.1), obstacles, springs=stiffness, **options)
 
 
 def multiplications(stiffness, **options):
     """Those by F, and how many motions were soft."""
-    p = foundation(stiffness, **options)
-    p.solve()
-    counted, soft = p.report.F_multiplications, p.report.soft_modes
-    p.destroy()
-    return counted, soft
+    _, report = solved(foundation(stiffness, **options))
+    return report.F_multiplications, report.soft_modes
 
 
 @pytest.mark.parametrize("options", [{"contact": False}, {"qp_type": "newton"}])
@@ -47,19 +39,11 @@ def test_springs_in_clusters():
     """Their motions are among those of subdomains, which the preconditioner has in clusters."""
     without, _ = multiplications(0.0)
     for stiffness in (1e-3, 1e4):
-        u, v = (displaced(foundation(stiffness, rtol=1e-8, clusters=count)) for count in (0, 4))
+        u, v = (solved(foundation(stiffness, rtol=1e-8, clusters=count))[0] for count in (0, 4))
         assert np.abs(u - v).max(initial=0.0) <= 1e-6 * largest(u)
         counted, motions = multiplications(stiffness, clusters=4)
         assert motions == 6 * SUBDOMAINS
         assert counted <= 1.5 * without
-
-
-def displaced(p):
-    """The displacement, on this rank."""
-    p.solve()
-    u = p.solution.u.copy()
-    p.destroy()
-    return u
 
 
 def test_springs_are_soft_in_the_mean():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies import held, pressed, sided, stacked, stiffer_above, two_body_problem
+from bodies import held, pressed, sided, sides_of, stacked, stiffer_above, two_body_problem
 from scipy.sparse import csr_array
 
 # the rows alone matter: no step of the solver is made
@@ -13,10 +13,8 @@ UP, DOWN = ("upper bottom", "lower top"), ("lower top", "upper bottom")  # secon
 def extremes(cell, n, subdomains, scaling="stiffness", pair=UP, stiffness=1.0):
     """Of a box on a box, n = (cells of the lower, cells of the upper), the upper one stiffer."""
     d = stacked(cell, *n, subdomains)
-    sides = ["lower bottom", "lower left", "upper left"]
-    sides += ["lower front", "upper front"] if d.mesh.geometry.dim == 3 else []
     stress = stiffer_above(d, stiffness)
-    given = d, pressed(d), held(d, *sides), [sided(*pair)]
+    given = d, pressed(d), held(d, *sides_of(cell)), [sided(*pair)]
     p = two_body_problem(*given, stress=stress, scaling=scaling, **ROWS_ONLY)
     p.solve()
     indptr, indices, data = p.dual.constraints.B.getValuesCSR()

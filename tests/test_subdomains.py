@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from bodies import held, pressed, sided, stacked, two_body_problem
-from mpi4py import MPI
 from petsc4py import PETSc
+from test_local_operators import applied, random
 from test_solvable_lp import dual_of
 
 
@@ -18,11 +18,7 @@ def scene():
     p.destroy()
 
 
-def random(n, seed=0):
-    return np.random.default_rng(seed + MPI.COMM_WORLD.rank).standard_normal(n)
-
-
-def applied(p, u):
+def multiplied(p, u):
     """K u in primal order, with the K that DOLFINx has assembled."""
     return p.dofs.to_primal(p._system.forms.stiffness() @ p.dofs.to_dolfinx(u))
 
@@ -43,14 +39,14 @@ def test_stiffnesses_are_on_the_arrays_of_petsc_and_hold_their_kernels_once(scen
 def test_energies(scene):
     p, subdomains = scene
     u = random(num_dofs(p))
-    assert np.sum(subdomains.energies(u)) == pytest.approx(u @ applied(p, u), rel=1e-12)
+    assert np.sum(subdomains.energies(u)) == pytest.approx(u @ multiplied(p, u), rel=1e-12)
 
 
 def test_kernel_motions_cost_nothing(scene):
     p, subdomains = scene
     alpha = random(subdomains.kernel_rows.shape[1])
     motion = subdomains.kernel_motion(alpha)
-    assert np.abs(applied(p, motion)).max(initial=0.0) <= 1e-12
+    assert np.abs(multiplied(p, motion)).max(initial=0.0) <= 1e-12
     assert np.allclose(subdomains.kernel_rows @ alpha, motion[subdomains.trace], atol=1e-14)
     f = p.dofs.to_primal(p._system.forms.load())
     assert subdomains.kernel_load @ alpha == pytest.approx(f @ motion, abs=1e-13)
@@ -59,10 +55,7 @@ def test_kernel_motions_cost_nothing(scene):
 def test_the_local_operator_and_recovery_are_one_generalised_inverse(scene):
     _, subdomains = scene
     w = random(len(subdomains.trace))
-    out = np.full_like(w, np.nan)
-    operator = subdomains.local_operator("pinv")
-    operator.prepare()
-    operator.mult(w, out)
+    out = applied(subdomains.local_operator("pinv"), w)
     u = subdomains.solve(subdomains.extended(w))
     assert np.allclose(u[subdomains.trace], out, atol=1e-12 * np.abs(out).max(initial=0.0))
 
@@ -72,11 +65,9 @@ def test_local_operators_measure_the_energy_of_trace_vectors(scene, kind):
     """wᵀK_bb w is that of w without the inside, wᵀSw the least of all insides."""
     p, subdomains = scene
     w, u = random(len(subdomains.trace)), np.zeros(num_dofs(p))
-    out, operator = np.empty_like(w), subdomains.local_operator(kind)
-    operator.prepare()
-    operator.mult(w, out)
+    out = applied(subdomains.local_operator(kind), w)
     u[subdomains.trace] = w
-    energy = u @ applied(p, u)
+    energy = u @ multiplied(p, u)
     if kind == "stiffness":
         assert w @ out == pytest.approx(energy, rel=1e-12)
     else:

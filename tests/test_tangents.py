@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from bodies import searched, sided, stacked
+from bodies import dofs_on, nodal, searched, sided, stacked
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed
-from test_frames import dofs_on, nodal
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.constraints.gluing import glue, prescribe

@@ -6,11 +6,10 @@ import ufl
 from bodies import two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from scenes import decomposed, displacement
+from scenes import CELLS, decomposed, displacement
 
 import tfeti_dolfinx as tfeti
 
-CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 SAYS = r"Dirichlet condition 0 prescribes (\d+) facets that lie on tears inside a body"
 
 

@@ -296,14 +296,11 @@ def test_what_sticks_has_not_slipped(friction, gap, qp_type, monkeypatch):
     scene.problem.destroy()
 
 
-@pytest.mark.parametrize("seed", range(5))
+SEEDS = [*range(5), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(5, 50))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_random_path_is_right_at_every_step(seed):
-    assert follow(seed) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(5, 50))
-def test_many_random_paths_are_right_at_every_step(seed):
     assert follow(seed) == []
 
 

@@ -33,6 +33,7 @@ from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import (
     check_mesh,
     check_same_space,
+    checked_function,
     displacement_space,
     is_axisymmetric,
 )
@@ -135,7 +136,7 @@ class ContactProblem:
             given |= self._given_besides()
         V = displacement_space(a, decomposition, self.form_name)
         check_conditions(self.bcs, V)
-        self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
+        self.u = fem.Function(V, name="displacement") if u is None else checked_function(u, V, "u")
         self._first = np.array(self.u.x.array)
         self._given_stress = stress
         self._stress: Freezable | None = None
@@ -596,8 +597,3 @@ class ContactProblem:
         if self._stress is None or self._stress.expression is not sigma:
             self._stress = Freezable(sigma, self.u)
         return sigma
-
-    def _checked_u(self, u: fem.Function, V: fem.FunctionSpace, name: str = "u") -> fem.Function:
-        checked_type(u, fem.Function, name, "a dolfinx.fem.Function on the space of a")
-        check_same_space(u.function_space, V, name, "the space of a")
-        return u

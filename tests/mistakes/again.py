@@ -21,13 +21,9 @@ def gaps(value):
     return updated(gap=lambda s: value)
 
 
-def of_degree_2(s):
-    return s.space("Lagrange", 2, (2,))
-
-
 FORMS_AGAIN = {
     r"stiffness is from a space of degree 2 .*; expected a, a space of degree 1": updated(
-        stiffness=lambda s: s.a_on(of_degree_2(s))
+        stiffness=lambda s: s.a_on(s.space("Lagrange", 2, (2,)))
     ),
     r"Dirichlet condition 0 prescribes 2 facets that lie on tears": updated(
         values=lambda s: [exterior(s)]

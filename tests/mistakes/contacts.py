@@ -22,7 +22,7 @@ def shape(make):
 
 def distance(distance, gradient=UP):
     """Solve with an obstacle of two callables."""
-    return lambda s: s.with_distance(distance, gradient)
+    return lambda s: s.with_shape(tfeti.SignedDistance(distance, gradient))
 
 
 CONTACTS = {

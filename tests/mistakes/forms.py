@@ -36,10 +36,6 @@ def load(s, measure, tag):
     return {"L": ufl.inner(s.f, s.v) * measure(tag)}
 
 
-def pure(s):
-    return ufl.FunctionSpace(s.d.mesh.ufl_domain(), s.V.ufl_element())
-
-
 def other_ds(s):
     """Facet tags that are equal, but other ones."""
     tags = s.d.facet_tags
@@ -74,7 +70,7 @@ SPACES = {
         decomposition=s.cube.d, a=laplacian(s.cube.space("Lagrange", 1, (2,)), s.cube)
     ),
     r"the space is a FunctionSpace; expected a dolfinx.fem.FunctionSpace": lambda s: s.problem(
-        a=laplacian(pure(s), s)
+        a=laplacian(ufl.FunctionSpace(s.d.mesh.ufl_domain(), s.V.ufl_element()), s)
     ),
 }
 

@@ -88,27 +88,19 @@ MARKERS = {
 }
 
 
-def untorn_function(s):
-    return fem.Function(s.untorn_space("Lagrange", 1))
-
-
-def torn_function(s):
-    return fem.Function(s.space("Lagrange", 1))
-
-
 ORIGINALS = {
     r"f is an array of shape \(3,\); expected a dolfinx.fem.Function on the mesh that": lambda s: (
         s.d.from_original(np.zeros(3))
     ),
     r"f is on another mesh; expected a function on the mesh that was given to": lambda s: (
-        s.d.from_original(torn_function(s))
+        s.d.from_original(fem.Function(s.space("Lagrange", 1)))
     ),
     r"f is from .*, whose unknowns depend on the directions of edges and facets;": lambda s: (
         s.d.from_original(fem.Function(s.untorn_space("RTCF", 1)))
     ),
     r"there is no mesh before it was torn: read_gmsh makes none; expected a": lambda s: model(
         meshed, 2
-    )(s).from_original(untorn_function(s)),
+    )(s).from_original(fem.Function(s.untorn_space("Lagrange", 1))),
 }
 
 TABLES = ("MESHES", "SUBDOMAINS", "TAGS", "NAMES", "MARKERS", "ORIGINALS")

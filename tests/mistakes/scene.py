@@ -157,10 +157,6 @@ class Scene:
         """Solve with an obstacle below the body."""
         return self.with_contacts(tfeti.Obstacle("bottom", shape))
 
-    def with_distance(self, distance, gradient):
-        """Solve with an obstacle of two callables below the body."""
-        return self.with_shape(tfeti.SignedDistance(distance, gradient))
-
     def options(self, **options):
         """The problem with some options."""
         return self.problem(petsc_options=options)

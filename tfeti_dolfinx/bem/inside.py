@@ -220,7 +220,8 @@ class _Seen:
 def _cuts(panels: Panels, points: Array, values: Array) -> Iterator[_Cut]:
     """Cut panels as finely as the distances to points require, with their corner values."""
     for some in in_chunks(np.arange(len(points)), 4 * len(panels.nodes)):
-        point, panel = np.repeat(some, len(panels.nodes)), np.tile(_all(panels), len(some))
+        count = len(panels.nodes)
+        point, panel = np.repeat(some, count), np.tile(np.arange(count), len(some))
         corners, carried, measure = panels.corners[panel], values[panel], panels.measure[panel]
         for level in range(PARAMETERS.halvings + 1):
             apart = np.linalg.norm(points[point] - corners.mean(axis=1), axis=1)
@@ -248,10 +249,6 @@ def _cuts(panels: Panels, points: Array, values: Array) -> Iterator[_Cut]:
             point, panel, measure = (
                 np.tile(item, len(parts)) for item in (point, panel, measure / len(parts))
             )
-
-
-def _all(panels: Panels) -> Array:
-    return np.arange(len(panels.nodes))
 
 
 @cache

@@ -183,7 +183,8 @@ def surfaces(dofs: TornDofs, decomposition: Decomposition, chosen: Array) -> dic
         local_corners = facet_vertices(mesh.topology.cell_type)[local]
         nodes = np.take_along_axis(corners, local_corners, axis=1)
         middle, where = x[corners].mean(axis=1), position[cell]
-        normals = _sum_at(nodes, _hat_normals(x, nodes, middle), x.shape)
+        normals = np.zeros(x.shape)
+        np.add.at(normals, nodes, _hat_normals(x, nodes, middle))
         cuts = [nodes]
         if nodes.shape[1] == 4:
             cuts = _triangles(x, nodes)
@@ -195,12 +196,6 @@ def surfaces(dofs: TornDofs, decomposition: Decomposition, chosen: Array) -> dic
             own = tuple(Panels(x[first:last], cut[where == s] - first) for cut in cuts)
             found[s] = Surface(own, normals[first:last])
     return found
-
-
-def _sum_at(nodes: Array, values: Array, shape: tuple[int, ...]) -> Array:
-    total = np.zeros(shape)
-    np.add.at(total, nodes, values)
-    return total
 
 
 def _hat_normals(x: Array, nodes: Array, middle: Array) -> Array:

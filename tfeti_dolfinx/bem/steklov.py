@@ -259,7 +259,8 @@ def law_of(K: Any, surface: Surface, name: str) -> IsotropicLaw:
     moved = np.hstack((linear, np.tile(np.eye(d), (len(x), 1)) * np.abs(y).max()))
     forces = K @ moved
     C = (linear.T @ forces[:, : d * d] / surface.panels.volume).reshape(d, d, d, d)
-    law = _isotropic(C)
+    mu, lmbda = float(C[0, 1, 0, 1]), float(C[0, 0, 1, 1])
+    law = IsotropicLaw(mu, lmbda / (2.0 * (lmbda + mu)) if lmbda + mu > 0.0 else np.nan)
     expected = np.zeros_like(forces)
     stress = law.stress(np.eye(d * d).reshape(d * d, d, d))
     expected[:, : d * d] = np.einsum("lki,ni->nkl", stress, surface.normals).reshape(-1, d * d)
@@ -271,12 +272,6 @@ def law_of(K: Any, surface: Surface, name: str) -> IsotropicLaw:
             "constant moduli, or finite elements for this volume"
         )
     return law
-
-
-def _isotropic(C: Array) -> IsotropicLaw:
-    """μ and ν of a tensor that is isotropic."""
-    mu, lmbda = float(C[0, 1, 0, 1]), float(C[0, 0, 1, 1])
-    return IsotropicLaw(mu, lmbda / (2.0 * (lmbda + mu)) if lmbda + mu > 0.0 else np.nan)
 
 
 # --- A subdomain with its surface nodes in boundary element order -----------------------------

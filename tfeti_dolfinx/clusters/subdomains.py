@@ -347,7 +347,10 @@ class Saddle:
     """
 
     def __init__(self, F: Array, G: Array, N: Array) -> None:
-        self._mu, self._alpha = _scales(F, G)
+        # the diagonals of F and of G diag(F)⁻¹Gᵀ become 1
+        self._mu = np.diag(F) ** -0.5
+        size = np.sum((G * self._mu) ** 2, axis=1)
+        self._alpha = np.where(size > 0.0, size, 1.0) ** -0.5
         G = self._alpha[:, None] * G * self._mu
         self._free, _ = np.linalg.qr(N / self._alpha[:, None])
         try:
@@ -377,13 +380,6 @@ class Saddle:
     @staticmethod
     def _upper(L: Array, b: Array) -> Array:
         return np.asarray(solve_triangular(L, b, trans=1, lower=True, check_finite=False))
-
-
-def _scales(F: Array, G: Array) -> tuple[Array, Array]:
-    """Scales that make the diagonals of F and of G diag(F)⁻¹Gᵀ 1."""
-    mu = np.diag(F) ** -0.5
-    size = np.sum((G * mu) ** 2, axis=1)
-    return mu, np.where(size > 0.0, size, 1.0) ** -0.5
 
 
 # --- Subdomains of a rank in clusters ---------------------------------------------------------
@@ -527,12 +523,11 @@ class ClusteredSubdomains(Subdomains):
 
     def _glue(self) -> Glue:
         """Z and W of the present trace."""
-        if self._glued is None:
-            inner = super().local_operator("pinv", once=True)
-            inner.prepare()
-            self.glue(inner)
-        assert self._glued is not None
-        return self._glued
+        if self._glued is not None:
+            return self._glued
+        inner = super().local_operator("pinv", once=True)
+        inner.prepare()
+        return self.glue(inner)
 
     def glue(self, inner: LocalOperator) -> Glue:
         """Z and W, made with K⁺ of the subdomains on the trace."""
@@ -591,14 +586,12 @@ class ClusterPinv:
 
 
 def _nulls(G: csr_array, places: list[tuple[Array, Array]]) -> csr_array:
-    """null(Gᵀ) of all clusters, G of motions × averages."""
-    parts = [_null_of(G[motions][:, rows].toarray()) for rows, motions in places]
+    """null(Gᵀ) of all clusters, G of motions × averages; of each an orthonormal basis."""
+    parts = list[Array]()
+    for rows, motions in places:
+        G_c = G[motions][:, rows].toarray()
+        values, vectors = np.linalg.eigh(G_c @ G_c.T)
+        parts.append(vectors[:, values <= PARAMETERS.null * values.max(initial=0.0)])
     order = joined([motions for _, motions in places]).astype(np.int64)
     stacked = csr_array(block_diag(parts)) if parts else csr_array((0, 0))
     return csr_array(stacked[np.argsort(order)])
-
-
-def _null_of(G: Array) -> Array:
-    """Return an orthonormal basis of null(Gᵀ)."""
-    values, vectors = np.linalg.eigh(G @ G.T)
-    return np.asarray(vectors[:, values <= PARAMETERS.null * values.max(initial=0.0)])

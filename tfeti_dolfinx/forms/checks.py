@@ -24,7 +24,7 @@ from ufl.variable import Variable
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.validation import is_whole, named, shown
+from tfeti_dolfinx.common.validation import checked_type, is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, known_tags
 from tfeti_dolfinx.mesh.dofs import check_space, described, is_same_space
@@ -118,6 +118,13 @@ def is_zero(form: Any) -> bool:
     if isinstance(form, ufl.Form):
         return all(isinstance(integral.integrand(), Zero) for integral in form.integrals())
     return isinstance(form, ufl.ZeroBaseForm) and len(form.arguments()) == 1
+
+
+def checked_function(u: Any, V: fem.FunctionSpace, name: str) -> fem.Function:
+    """Return a function of the space of a, checked. Collective."""
+    checked_type(u, fem.Function, name, "a dolfinx.fem.Function on the space of a")
+    check_same_space(u.function_space, V, name, "the space of a")
+    return u
 
 
 def check_same_space(V: Any, W: fem.FunctionSpace, what: str, whose: str) -> None:

@@ -167,14 +167,14 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     (normal,) = _normals(hats, corners, hats.points.mean(axis=0)[None])
     area = (0.5 if kind.hats.facet == "triangle" else 1.0) * np.linalg.norm(normal, axis=1)
     outward = np.sum(normal * (corners.mean(axis=1) - inside), axis=1)
-    normal = _unit(np.where(outward < 0.0, -1.0, 1.0)[:, None] * normal)
+    normal = unit(np.where(outward < 0.0, -1.0, 1.0)[:, None] * normal)
     at_vertices = _normals(kind.geometry, x, hats.points)
     sign = np.sign(np.sum(at_vertices * normal, axis=2, keepdims=True))
     return Facets(
         x=np.ascontiguousarray(x),
         groups=dofs.group[facet_nodes(dofs, facets)],
         normal=normal,
-        vertex_normals=np.ascontiguousarray((sign * _unit(at_vertices)).swapaxes(0, 1)),
+        vertex_normals=np.ascontiguousarray((sign * unit(at_vertices)).swapaxes(0, 1)),
         area=area,
         curvature=np.zeros((len(x), gdim, gdim)),
         held=np.zeros((len(x), hats.size), dtype=bool),
@@ -202,7 +202,7 @@ def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array
     Return the averaged normal of each owned group, too, 0 off them, shape ``(g, gdim)``.
     """
     groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
-    averaged = _unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
+    averaged = unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
     (at_vertices,) = dofs.lookup(groups, averaged)
     return replace(facets, vertex_normals=at_vertices.reshape(weighted.shape)), averaged
 
@@ -216,7 +216,7 @@ def _normals(element: FacetElement, x: Array, xi: Array) -> Array:
     return np.cross(*tangents)
 
 
-def _unit(vectors: Array) -> Array:
+def unit(vectors: Array) -> Array:
     """Return vectors over their lengths, along the last axis; 0 stays 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)

@@ -20,6 +20,7 @@ from tfeti_dolfinx.mortar.facets import (
     densities,
     points,
     reference_points,
+    unit,
 )
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
@@ -104,7 +105,7 @@ def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple
     """
     s_centre, s_size = secondary.centre, secondary.radius
     p_centre, p_size = primary.centre, primary.radius
-    direction = centre_normals(secondary)
+    direction = unit(secondary.vertex_normals.sum(axis=1))
     keys: list[Array] = [np.empty(0, dtype=np.int64)]
     classes = np.floor(np.log2(np.maximum(p_size, 1e-300))).astype(np.int64)
     for size_class in np.unique(classes) if len(secondary) else ():
@@ -119,12 +120,6 @@ def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple
         close = (aside <= sizes) & (np.abs(along) <= distance + sizes + p_size[p])
         keys.append(s[close] * len(primary) + p[close])
     return np.divmod(np.unique(np.concatenate(keys)), max(len(primary), 1))
-
-
-def centre_normals(facets: Facets) -> Array:
-    """Mean of each facet's averaged vertex normals, of unit length, shape ``(n, gdim)``."""
-    total = facets.vertex_normals.sum(axis=1)
-    return total / np.linalg.norm(total, axis=1, keepdims=True)
 
 
 def _march(
@@ -239,7 +234,7 @@ class _Planes:
     def __init__(self, kind: FacetKind, secondary: Facets, primary: Facets) -> None:
         self._kind, self._secondary, self._primary = kind, secondary, primary
         self._order = POLYGON[kind.hats.facet]
-        self.normal = centre_normals(secondary)
+        self.normal = unit(secondary.vertex_normals.sum(axis=1))
         self._centre, self._tangents = secondary.corners.mean(axis=1), tangents(self.normal)
         self.nodes = self._on_planes(secondary.x, np.arange(len(secondary)))
         self.corners = self.nodes[:, : kind.hats.size]

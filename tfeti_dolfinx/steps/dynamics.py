@@ -22,6 +22,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.dual import Dual, contact_set
 from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.checks import checked_function
 from tfeti_dolfinx.forms.elasticity import Modulus
 from tfeti_dolfinx.forms.newmark import InertialForms, check_copies, mass_form
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -263,7 +264,7 @@ class ContactDynamics(ContactProblem):
             raise InputError("rtol auto: errors of steps in time are not estimated; expected one")
         v = np.zeros_like(self.u.x.array)
         if velocity is not None:
-            v = self._checked_u(velocity, self.dofs.V, "velocity").x.array
+            v = checked_function(velocity, self.dofs.V, "velocity").x.array
         check_copies(self.u.x.array, self.dofs, "u, the displacement at the start,")
         check_copies(v, self.dofs, "velocity")
         self._system.forms.inertia.move(np.array(self.u.x.array), np.array(v))
