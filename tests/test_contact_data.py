@@ -1,11 +1,16 @@
 """The state of a contact's nodes: found by name, with signs that are kept."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from bodies import gathered, held, pressed, stacked, two_body_problem
-from scenes import decomposed, problem
+from bodies import drawn, gathered, held, pressed, stacked, two_body_problem
+from dolfinx import fem
+from scenes import decomposed, problem, vectors
 
 import tfeti_dolfinx as tfeti
+from meshes import half_ball, half_cylinder
+from meshes.tools import torn
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +63,34 @@ def test_resultants_and_reactions_are_in_balance(stack):
     assert np.allclose(total, (0.0, 0.1), rtol=0, atol=1e-7)
     moment = floor.resultant.moment[2] + sum(side.moment[2] for side in sides)
     assert np.isclose(moment, 0.05, rtol=0, atol=1e-7)  # of the load, at the middle of the side
+
+
+@pytest.mark.parametrize("mesh", [half_cylinder, half_ball])
+def test_moments_on_curved_facets_are_in_balance(mesh, comm):
+    """Facets of degree 2 are curved: a force acts on all their nodes, not at ends of chords."""
+    build = partial(mesh.build, fine=0.2, fine_radius=0.3, growth=0.5)
+    d = torn(comm, build, 3, order=2)
+    gdim = d.mesh.geometry.dim
+    V, *_ = vectors(d, 2)
+    top = fem.locate_dofs_topological(V, gdim - 1, d.facets("top"))
+    given = np.array([0.003, -0.002, -0.01] if gdim == 3 else [0.003, -0.01])
+    way = fem.Function(V)
+    way.interpolate(lambda x: given[:, None] * (1.0 + x[0]))
+    plane = tfeti.Plane((0.0,) * gdim, (0.0,) * (gdim - 1) + (1.0,))
+    p = two_body_problem(
+        d,
+        drawn(d, "top", np.zeros(gdim)),
+        lambda V: [fem.dirichletbc(way, top)],
+        [tfeti.Obstacle("contact", plane, friction=tfeti.Coulomb(0.3))],
+        degree=2,
+        rtol=1e-10,
+    )
+    p.solve()
+    pushed, kept = p.solution.contact().resultant, p.solution.reaction("top")
+    size = np.abs(pushed.moment).max()
+    assert size > 1e-6
+    assert np.allclose(pushed.force, -kept.force, rtol=0, atol=1e-9)
+    assert np.allclose(pushed.moment, -kept.moment, rtol=0, atol=1e-7 * size)
 
 
 def test_a_reaction_is_the_force_of_the_stress(comm):

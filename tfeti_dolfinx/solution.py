@@ -357,10 +357,9 @@ class Solution:
             position = given["contact"] = position_of(names, which)
         records = self.gluing.records
         own = records.contact == position
-        points, places = (x[records.group[own]] for x in (group_points(self.dofs), self.places()))
         friction, area = self.tangential_force[own], self.area[own, None]
         return ContactData(
-            points=points,
+            points=group_points(self.dofs)[records.group[own]],
             normal=records.normal[own],
             force=self.force[own],
             pressure=self.contact_pressure[own],
@@ -370,8 +369,29 @@ class Solution:
             tangential_traction=quotient(friction, area),
             slip=self.slip_of_conditions[own],
             surface=self.contacts[position].surfaces[0],
-            resultant=resultant(self.dofs.comm, places, self.condition_forces[own]),
+            resultant=self._resultant(position),
         )
+
+    def _resultant(self, position: int) -> Resultant:
+        """Resultant of a contact's forces on the secondary side. Collective.
+
+        Facets of degree 2 may be curved: lever arms are those of all their nodes.
+        """
+        records, dofs = self.gluing.records, self.dofs
+        own = records.contact == position
+        group, force = records.group[own], self.condition_forces[own]
+        if dofs.V.element.basix_element.degree > 1:
+            of = np.flatnonzero(own[records.condition])
+            shares = records.weight[of, None] * self.condition_forces[records.condition[of]]
+            group = self._groups_on(self.contacts[position].surfaces[0])
+            force = dofs.reduce_on_owners(records.entry_group[of], shares)[group]
+        return resultant(dofs.comm, self.places()[group], force)
+
+    def _groups_on(self, surface: str | int) -> Array:
+        """Owned groups of the nodes of a surface, ascending. Collective."""
+        member = np.zeros(self.dofs.num_nodes, dtype=bool)
+        member[facet_nodes(self.dofs, surface_facets(self.decomposition, surface))] = True
+        return np.flatnonzero(self.dofs.reduce(member, np.logical_or))
 
     def tool(self, which: int | str = 0) -> ToolState:
         """Return motion and forces of a rigid body. Collective.
@@ -410,10 +430,7 @@ class Solution:
         """
         with agreeing(self.dofs.comm, "reaction") as given:
             given["surface"] = self.decomposition.surface(surface)
-        facets = surface_facets(self.decomposition, surface)
-        member = np.zeros(self.dofs.num_nodes, dtype=bool)
-        member[facet_nodes(self.dofs, facets)] = True
-        groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or))
+        groups = self._groups_on(surface)
         # −Bᵀλ, summed over the copies of a node, less the contact forces: gluing forces cancel
         constraints = self.gluing.constraints
         own = constraints.trace < len(self.u)  # those behind are of rigid bodies
