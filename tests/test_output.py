@@ -194,7 +194,10 @@ def test_a_colour_that_is_not_known_is_named(solution, shared_tmp):
     with pytest.raises(InputError, match=r"show='stress': expected one of von_mises, pressure"):
         plot_deformed(shared_tmp / "none.png", solution, show="stress")
     with pytest.raises(InputError, match="no contact of the solution has friction"):
-        plot_friction(shared_tmp / "none.png", solution, lambda x: x[0])
+        plot_friction(shared_tmp / "none.png", solution)
+    for wrong in (lambda x: x[0], "floor", []):
+        with pytest.raises(InputError, match=r"contacts is .*; expected names or positions, such"):
+            plot_friction(shared_tmp / "none.png", solution, wrong)
 
 
 def test_pyvista_has_the_bodies_without_tears(solution, comm):

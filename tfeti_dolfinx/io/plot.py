@@ -250,9 +250,14 @@ def plot_friction(
         given |= {"path": path, "contacts": contacts, "axes": axes, "labels": labels}
         given["normal"] = normal
         target = checked_path(path, ".png")
+        chosen = range(len(solution.contacts)) if contacts is None else contacts
+        if isinstance(chosen, str) or not isinstance(chosen, Sequence) or not chosen:
+            raise InputError(
+                f"contacts is {shown(contacts)}; expected names or positions, such as ['floor'], "
+                "or None for all contacts"
+            )
         if not solution.has_friction:
             raise InputError("plot_friction: no contact of the solution has friction")
-    chosen = contacts if contacts is not None else range(len(solution.contacts))
     data = [solution.contact(name) for name in chosen]
     gdim = data[0].normal.shape[1]
     rows = [
