@@ -97,9 +97,13 @@ def check_bodies(d):
     assert d.num_bodies == 2
 
 
-def test_a_model_in_memory(comm):
+@pytest.mark.parametrize("apart", [1, 100])
+def test_a_model_in_memory(comm, apart):
+    """The ids of its nodes may be far apart."""
     if ROOT:
         two_bodies("quadrilateral")
+        ids = gmsh.model.mesh.getNodes()[0]
+        gmsh.model.mesh.renumberNodes(ids, apart * ids)
     d = tfeti.read_gmsh(gmsh.model, comm, 4)
     check_bodies(d)
     assert d.num_subdomains == 4
