@@ -38,7 +38,8 @@ class NewtonTolerances:
             that are let go.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
         curvature: A step is shortened where the residual along it, contact forces included, has
-            at its end more than this share of its value at its begin, with the other sign.
+            at its end more than this share of its value at its begin, with the other sign; None:
+            0.3, in finite strain 0.5, where places are new after a shortened step.
         max_line_search: Most residuals that a line search assembles.
         rounding: Share of dᵀD d, D the diagonal of J, that is rounding of dᵀJ d: a rigid step has
             no energy.
@@ -73,7 +74,7 @@ class NewtonTolerances:
     last: float = 2.0
     nothing: float = 1e-12
     nowhere: float = 1e-13
-    curvature: float = 0.3
+    curvature: float | None = None
     max_line_search: int = 12
     rounding: float = 1e-11
     shortest: float = 0.01

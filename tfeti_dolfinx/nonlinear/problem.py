@@ -134,9 +134,10 @@ class NonlinearContactProblem(ContactProblem):
             checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")
             given["tolerances"] = asdict(tolerances)
         self._tolerances = tolerances
-        forcing, loosest = (0.3, 0.01) if finite else (1.5, 0.1)
+        forcing, loosest, curvature = (0.3, 0.01, 0.5) if finite else (1.5, 0.1, 0.3)
         self._forcing = forcing if tolerances.forcing is None else tolerances.forcing
         self._loosest = loosest if tolerances.loosest is None else tolerances.loosest
+        self._curvature = curvature if tolerances.curvature is None else tolerances.curvature
         self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
@@ -354,13 +355,13 @@ class NonlinearContactProblem(ContactProblem):
         b, high = self._longest(u, d, forces)
         # of a step that is rigid, or nearly, slopes are rounding and say nothing
         remainder = abs(high / start) if abs(start) > rounding else 1.0
-        if high <= max(tol.curvature * abs(start), rounding):
+        if high <= max(self._curvature * abs(start), rounding):
             return b, remainder
         a, low = 0.0, start
         for _ in range(tol.max_line_search):  # regula falsi in Illinois' form
             t = b - high * (b - a) / (high - low)
             slope = self._slope(u, d, t) + forces
-            if abs(slope) <= tol.curvature * abs(start):
+            if abs(slope) <= self._curvature * abs(start):
                 break
             if slope > 0.0:
                 b, high, low = t, slope, 0.5 * low
