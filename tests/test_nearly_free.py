@@ -4,7 +4,7 @@ import basix.ufl
 import numpy as np
 import pytest
 import ufl
-from bodies import two_body_problem
+from bodies import boxes, drawn, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
@@ -187,3 +187,26 @@ def test_a_clamped_beam_needs_no_contact_to_hold_it():
     p = problem(d, (0.0, -1e-4), [tfeti.Obstacle("bottom", tfeti.Plane((0, -0.01), (0, 1)))])
     p.solve()
     assert (p.report.active_contacts > 0, p.report.warnings) == (True, [])
+
+
+@pytest.mark.parametrize(("share", "rtol"), [(1e-5, 1e-4), (1e-3, 1e-2)])
+def test_forces_hold_a_light_body_beside_one_that_is_pressed(share, rtol):
+    """They are small beside errors of the other's; of a third body, that nothing loads, none."""
+    parts = [(name, (2.0 * i, 0.0), (2.0 * i + 1.0, 1.0), (8, 8)) for i, name in enumerate("abc")]
+    mesh, tags, names = boxes("triangle", parts)
+    d = tfeti.decompose(mesh, 6, facet_tags=tags, surfaces=names)
+    floor = tfeti.SignedDistance(
+        lambda x: x[1] + 0.002 * np.cos(7.0 * x[0]),
+        lambda x: np.stack((-0.014 * np.sin(7.0 * x[0]), np.ones_like(x[0]))),
+    )
+    contacts = [tfeti.Obstacle(f"{name} bottom", floor) for name in "abc"]
+
+    def load(v, ds):
+        return drawn(d, "a top", (0.0, -0.01))(v, ds) + drawn(d, "b top", (0.0, -0.01 * share))(
+            v, ds
+        )
+
+    p = two_body_problem(d, load, lambda V: [], contacts, rtol=rtol)
+    p.solve()
+    forces = [p.solution.contact(k).resultant.force[1] for k in range(3)]
+    assert np.allclose(forces, (0.01, 0.01 * share, 0.0), rtol=1e-6, atol=0.0)

@@ -29,6 +29,7 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts,
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.feti.recovery import let_go
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import (
     check_mesh,
@@ -300,8 +301,7 @@ class ContactProblem:
         if state is not None and state.loose.count > dual.coarse.free_motions.count:
             self._let_go = state.loose.moving
             if result.reason > 0:  # forces of contact there are the solver's error
-                rows = np.append(dual.coarse.bounded, dual.coarse.rubbing)
-                lam[rows[~state.active[rows]]] = 0.0
+                lam[let_go(dual.coarse, state)] = 0.0
         # 2. their displacement
         with stage("recovery", seconds):
             multipliers = Multipliers(lam, result.face)

@@ -197,6 +197,14 @@ class CoarseSpace(Coarse):
         self.factors.count += int(self.dimension > 0)
         return ObliqueProjectors(self.grams, self.rows, face, C, self.factors.null)
 
+    def rows_driven(self, free: Motions) -> Array:
+        """Return local rows that act on bodies which the load drives along free motions."""
+        motion = bcast_from_root(self.comm, self.bodies.driven(free, self.work(self.e)))
+        if motion is None:
+            return np.empty(0, dtype=np.int64)
+        moved = np.any(motion.reshape(self.bodies.count, -1), axis=1)
+        return self.J.row[moved[self.J.body]]
+
     def unresisted(self, rows: Array, within: Motions | None = None) -> Motions:
         """Return motions of a space that rows do not resist.
 

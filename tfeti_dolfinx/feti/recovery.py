@@ -73,13 +73,22 @@ def recover(
     gap = residual - coarse.Gt @ alpha
     # what sticks to a given bound holds, pushed or not; under Coulomb's law what is pushed or pulls
     borne, active = np.abs(lam) > no_effect * error, np.zeros(len(lam), dtype=bool)
-    active[coarse.bounded] = borne[coarse.bounded]
-    active[coarse.rubbing] = True
     at = constraints.pressed
     rows = constraints.sets.tangents[at]
-    active[rows] = (borne[constraints.pressed_by[at]] | np.any(borne[rows], axis=1))[:, None]
-    active &= face.carrying
-    return Recovered(np.array(lam), u, gap, residual, active, coarse.unresisted(active))
+    while True:
+        active[coarse.bounded] = borne[coarse.bounded]
+        active[coarse.rubbing] = True
+        pulled = borne[constraints.pressed_by[at]] | np.any(borne[rows], axis=1)
+        active[rows] = pulled[:, None]
+        active &= face.carrying
+        loose = coarse.unresisted(active)
+        # what the load drives is resisted: there forces count that are small beside others
+        light = np.zeros(len(lam), dtype=bool)
+        light[coarse.rows_driven(loose)] = True
+        light &= (lam != 0.0) & ~borne
+        if not any_rank(coarse.comm, light):
+            return Recovered(np.array(lam), u, gap, residual, active, loose)
+        borne |= light
 
 
 def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float) -> Recovered:
@@ -105,6 +114,20 @@ def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float) -> Recov
     alpha = coarse.motions @ np.asarray(N @ bcast_from_root(comm, motion))
     u, gap = state.u + coarse.kernel_motion(alpha), state.gap - coarse.Gt @ alpha
     return replace(state, u=u, gap=gap)
+
+
+def let_go(coarse: CoarseSpace, state: Recovered) -> Array:
+    """Return the rows of contact of loose bodies that no row with a force acts on. Collective.
+
+    Forces there are the solver's error.
+    """
+    J, touched = coarse.J, np.zeros(coarse.bodies.count)
+    touched[J.body[state.active[J.row]]] = 1.0
+    free = state.loose.moving & (summed(coarse.comm, touched) == 0.0)
+    contact = np.zeros(len(state.active), dtype=bool)
+    contact[np.append(coarse.bounded, coarse.rubbing)] = True
+    rows = J.row[free[J.body]]
+    return np.asarray(rows[contact[rows]])
 
 
 def without_loose(coarse: CoarseSpace, state: Recovered, u: Array) -> Array:

@@ -356,6 +356,23 @@ class Bodies:
         W, moments = self.frames, self._subdomains.moments(u)
         return np.asarray(np.einsum("bij,bi->bj", W, moments) / self.nodes[:, None]).ravel()
 
+    def driven(self, free: Motions, load: Array) -> Array | None:
+        """Return the part of a load's work on free motions, if it is more than rounding."""
+        if not free.count:
+            return None
+        alone = (free.alone @ (free.alone.T @ load)).reshape(self.count, self.k)
+        alone[np.linalg.norm(alone, axis=1) <= self.negligible] = 0.0
+        if np.any(alone):
+            return np.asarray(alone.ravel())
+        Q = orthonormal_columns(free.joint)
+        joint = np.asarray(Q @ (Q.T @ load))
+        each = np.linalg.norm(joint.reshape(self.count, self.k), axis=1)
+        if not joint @ load > self.negligible @ each:
+            return None
+        # a turn that facets hold a little is a small part of a free motion, but does the work
+        work = joint * np.abs(load)
+        return np.asarray(joint / np.abs(joint).max() + work / np.abs(work).max())
+
     def amounts(self, motion: Array) -> Array:
         """Return the coefficient of each mode in a motion, shape ``(bodies, k)``."""
         return np.einsum("bij,bj->bi", self.frames, motion.reshape(self.count, self.k))

@@ -14,7 +14,7 @@ from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.feti.rigid_bodies import Bodies, Motions, free_to_move, orthonormal_columns
+from tfeti_dolfinx.feti.rigid_bodies import free_to_move
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def check_solvable(
     ``load`` is its work on each motion of the bodies; ``pulling`` are local rows of contact that
     hold both ways, as far as is known before the solve.
     """
-    motion = bcast_from_root(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
+    motion = bcast_from_root(coarse.comm, coarse.bodies.driven(coarse.free_motions, load))
     reason = (
         "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
         "spring, or balance the load"
@@ -250,24 +250,6 @@ def rigid_scene(
     N, P = (vstack(rows, format="csr") for rows in (normals, pressing))
     load, noise = Z.T @ coarse.work(coarse.e), bodies.negligible[body]
     return RigidScene(load, noise, body, N, P, of_cones, of_given)
-
-
-def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
-    """Return the part of the load on free motions, if it is more than rounding."""
-    if not free.count:
-        return None
-    alone = (free.alone @ (free.alone.T @ load)).reshape(bodies.count, bodies.k)
-    alone[np.linalg.norm(alone, axis=1) <= bodies.negligible] = 0.0
-    if np.any(alone):
-        return np.asarray(alone.ravel())
-    Q = orthonormal_columns(free.joint)
-    joint = np.asarray(Q @ (Q.T @ load))
-    each = np.linalg.norm(joint.reshape(bodies.count, bodies.k), axis=1)
-    if not joint @ load > bodies.negligible @ each:
-        return None
-    # a turn that facets hold a little is a small part of a free motion, but does the work
-    work = joint * np.abs(load)
-    return np.asarray(joint / np.abs(joint).max() + work / np.abs(work).max())
 
 
 def _explained(
