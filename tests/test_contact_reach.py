@@ -65,6 +65,21 @@ def test_the_reach_does_not_change_the_answer(reach):
     assert relative(*(displacement(p)[1] for p in found)) <= 1e-7
 
 
+@pytest.mark.parametrize("rtol", [1e-2, 1e-3])
+def test_a_punch_from_afar_presses_by_little(rtol):
+    """Its way, of which rtol is a part, says nothing of how deep it presses."""
+    d = stacked("quadrilateral", 3, 4, 4, gap=0.3)
+
+    sides = ["lower bottom", "lower left", ("upper top", -0.3005), "upper left"]
+    forces = []
+    for one in (rtol, 1e-10):
+        p = two_body_problem(d, pressed(d, 0.0), held(d, *sides), [sided(*SIDES)], rtol=one)
+        p.solve()
+        forces.append(p.solution.contact(0).resultant.force[1])
+    assert forces[1] > 1e-4
+    assert forces[0] == pytest.approx(forces[1], rel=rtol)
+
+
 def test_a_body_that_only_a_far_obstacle_holds():
     """What is farther yet, and not needed, gets no rows."""
     d = decomposed("quadrilateral", 6)

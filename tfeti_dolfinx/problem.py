@@ -329,7 +329,7 @@ class ContactProblem:
         self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
         body = [*d.body_names, *system.tools.free_names][settling.body]
         conclude(result, accuracy, now, d.comm, excluding, body, settling.slides, warnings + notes)
-        return solution, accuracy.allowed.jump
+        return solution, accuracy.allowed.overlap
 
     def _log_warnings(self) -> None:
         """Log warnings on rank 0, each once, whatever figures are in what it says of its bodies."""

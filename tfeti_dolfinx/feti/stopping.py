@@ -186,6 +186,7 @@ class Tolerances:
     displacement: Array  # error of u for each body, a length, shape (bodies,)
     # jumps at tears, distances from Dirichlet values, overlaps, and distances where a force acts
     jump: float
+    overlap: float  # of nodes without a row: what is more than rounding may bear forces
     balance: float  # force left on a kernel mode
     energy: float  # norm of the correction in energy, over all bodies
     rounding: float  # its part that rounding leaves of bodies that do not deform
@@ -367,6 +368,7 @@ class Accuracy(StoppingRule):
         return Tolerances(
             displacement=displacement,
             jump=2.0 * largest,
+            overlap=2.0 * float(np.maximum(noise, at_rest).max(initial=0.0)),
             balance=balance + all_rest * now.stiffness.max(initial=0.0),
             energy=given.energy * self.rtol * now.energy + rigid,
             rounding=rigid,
