@@ -139,6 +139,14 @@ def curved_obstacle(gdim, gap=0.02):
     return tfeti.SignedDistance(distance, gradient)
 
 
+def bumpy(height, below):
+    """A wave in the plane, as distance and gradient, so far below y = 0 on the whole."""
+    return tfeti.SignedDistance(
+        lambda x: x[1] + height * np.cos(7.0 * x[0]) + below,
+        lambda x: np.stack((-7.0 * height * np.sin(7.0 * x[0]), np.ones_like(x[0]))),
+    )
+
+
 def gathered(dofs, node_values):
     """Points and values, one row per local primal node, of all groups of all ranks, by point."""
     total = dofs.reduce(node_values, np.add)

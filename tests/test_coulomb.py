@@ -6,7 +6,7 @@ import ufl
 from bodies import boxes, two_body_problem
 from dolfinx import fem, mesh
 from mpi4py import MPI
-from scenes import apart, clamp, decomposed, displacement, forms, problem, vectors
+from scenes import apart, bumpy, clamp, decomposed, displacement, forms, problem, vectors
 from test_friction_fields import SCENES, floor, solved
 from test_nearly_free import rings
 
@@ -172,3 +172,16 @@ def test_what_sticks_where_a_wall_pushes_slips():
     for one in data:
         size = np.linalg.norm(one.tangential_traction, axis=1)
         assert np.all(size <= 0.3 * one.pressure + 1e-8)
+
+
+@pytest.mark.parametrize(("weight", "side"), [(1e-4, 0.026), (1e-6, 0.2), (1e-7, 0.026)])
+def test_a_block_that_falls_onto_waves_is_held(weight, side):
+    """If all points stuck it would hang above them, and press nowhere."""
+    mesh, tags, names = boxes("quadrilateral", [("a", (0.0, 0.0), (1.0, 0.7), (6, 3))])
+    d = tfeti.decompose(mesh, 2, facet_tags=tags, surfaces=names)
+    contacts = [tfeti.Obstacle("a bottom", bumpy(0.004, 0.006), friction=tfeti.Coulomb(0.5))]
+    force = fem.Constant(d.mesh, (weight * side, -weight))
+    p = two_body_problem(d, lambda v, ds: ufl.dot(force, v) * ufl.dx, lambda V: [], contacts)
+    p.solve()
+    found = p.solution.contact().resultant.force[:2]
+    assert np.allclose(found, -0.7 * np.asarray(force.value), rtol=1e-6, atol=0.0)

@@ -8,7 +8,7 @@ from bodies import boxes, drawn, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, decomposed, problem
+from scenes import bumpy, clamp, decomposed, problem
 from true_errors import ring_problem
 
 import tfeti_dolfinx as tfeti
@@ -195,10 +195,7 @@ def test_forces_hold_a_light_body_beside_one_that_is_pressed(share, rtol):
     parts = [(name, (2.0 * i, 0.0), (2.0 * i + 1.0, 1.0), (8, 8)) for i, name in enumerate("abc")]
     mesh, tags, names = boxes("triangle", parts)
     d = tfeti.decompose(mesh, 6, facet_tags=tags, surfaces=names)
-    floor = tfeti.SignedDistance(
-        lambda x: x[1] + 0.002 * np.cos(7.0 * x[0]),
-        lambda x: np.stack((-0.014 * np.sin(7.0 * x[0]), np.ones_like(x[0]))),
-    )
+    floor = bumpy(0.002, 0.0)
     contacts = [tfeti.Obstacle(f"{name} bottom", floor) for name in "abc"]
 
     def load(v, ds):

@@ -193,7 +193,7 @@ class FrictionBounds:
         at = constraints.pressed
         self._rows = constraints.pressed_by[at]
         self._mu = np.linalg.norm(constraints.coefficients[at], axis=1)
-        self._stuck, self._slipped = start is None, False
+        self._stuck, self._rested, self._slipped = start is None, False, False
         self.now: Array = np.full(len(self._rows), np.inf)
         if start is not None:
             known = dual.pressures[at]
@@ -211,15 +211,31 @@ class FrictionBounds:
         return any_rank(self._comm, np.isinf(self.now))
 
     def hold(self) -> Array | None:
-        """Set the present bounds, else let all stick, once; return a motion that they let go."""
+        """Set the present bounds, else others, each once; return a motion that they let go.
+
+        Others are those of points that all stick. These may hang where they do not touch, which
+        tells no forces of normals: then those of a load that rests on one point.
+        """
         dual = self._dual
         dual.bound_friction(self.now)
         motion = None if self.stick else sliding_motion(dual.coarse, dual.constraints, dual.pulling)
-        if motion is None or self._stuck:
+        if motion is None or self._rested:
             return motion
-        self.now, self._stuck = np.full(len(self._rows), np.inf), True
+        if not self._stuck:
+            self.now, self._stuck = np.full(len(self._rows), np.inf), True
+            dual.bound_friction(self.now)
+            return None
+        self.now, self._rested = self._at_rest(), True
         dual.bound_friction(self.now)
-        return None
+        lets_go = sliding_motion(dual.coarse, dual.constraints, dual.pulling) is not None
+        return motion if lets_go else None
+
+    def _at_rest(self) -> Array:
+        """λ_N of points each of which bears the whole load of a body."""
+        coarse, weights = self._dual.coarse, np.zeros(self._constraints.num_rows)
+        loads = coarse.bodies.loads * np.sqrt(coarse.bodies.nodes)
+        np.maximum.at(weights, coarse.J.row, loads[coarse.J.body])
+        return np.asarray((weights / coarse.row_size)[self._rows])
 
     def turn(self, reason: ConvergedReason) -> bool:
         """Let all slip, once, where sticking contradicts itself, as beside a wall that pushes.
