@@ -197,10 +197,7 @@ CASES = {
         r"stress\(u\): ZeroDivisionError: no such place",
     ),
     "update on one": (update_on_one, r"rank \d has called update where rank 0 has called solve"),
-    "other times on one": (
-        other_times_on_one,
-        rf"the number of times is 3{ON}2 on rank 0",
-    ),
+    "other times on one": (other_times_on_one, rf"the number of times is 3{ON}2 on rank 0"),
     "a state that is cut on one": (broken, "the state is broken: u has"),
     "a condition of another value on one": (
         lambda s, folder: s.solved(bcs=[s.held(0.01 if ODD else 0.0)]),
@@ -221,10 +218,7 @@ CASES = {
         ),
         rf"contact is 1{ON}0 on rank 0",
     ),
-    "surfaces on others": (
-        decomposed_on_one,
-        rf"surfaces: left is the callable of_side{ON}1 on",
-    ),
+    "surfaces on others": (decomposed_on_one, rf"surfaces: left is the callable of_side{ON}1 on"),
     "an extension on one": (
         lambda s, folder: s.problem(extensions=Extensions(monitor=print) if ODD else None),
         rf"extensions: monitor is .*{ON}",

@@ -5,9 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import ufl
+from bodies import drawn, sided, stacked
 from dolfinx import fem
 from moving import Thrown
-from scenes import accepted, clamp, decomposed, forms, hooke, largest
+from scenes import (
+    accepted,
+    clamp,
+    decomposed,
+    forms,
+    hooke,
+    integral,
+    largest,
+    measures,
+    strain,
+    vectors,
+)
 from scenes import displacement as nodal
 
 import tfeti_dolfinx as tfeti
@@ -222,3 +234,27 @@ def test_a_state_or_a_solution_without_velocity():
     still.solve()
     with pytest.raises(tfeti.InputError, match="no velocity: expected the solution of a Contact"):
         still.solution.velocity  # noqa: B018
+
+
+def test_a_light_body_gets_its_momentum_from_the_force_on_it(comm):
+    """It hits one that is pressed: a blow that is small beside that, to a loose tolerance."""
+    d, tau, pushes = stacked("triangle", 4, 3, 3, upper=(0.4, 0.6), gap=0.02), 0.05, []
+    V, u, v = vectors(d)
+    above = ufl.conditional(ufl.gt(ufl.SpatialCoordinate(d.mesh)[1], 0.0), 1.0, 0.0)
+    thrown, now = fem.Function(V), fem.Function(V)
+    thrown.interpolate(lambda x: (0.0 * x[0], -0.1 * (x[1] > 0.01)))
+    now.x.array[:] = thrown.x.array
+    a, L = ufl.inner(hooke()(u), strain(v)) * ufl.dx, drawn(d, "lower left", (0.02, 0.0))
+    contacts, given = [sided("upper bottom", "lower top", reach=1.0)], {"velocity": thrown}
+    given |= {"mass": 1.0 - (1.0 - 1e-5) * above, "petsc_options": {"rtol": 1e-2}}
+    L, bcs = L(v, measures(d)[1]), [clamp(V, d.facets("lower bottom"))]
+    problem = tfeti.ContactDynamics(a, L, bcs, contacts, d, **given)
+    problem.take_step(tau)
+    for _ in range(6):
+        before = integral(1e-5 * above * now[1] * ufl.dx)
+        accepted(problem)
+        now.x.array[:] = problem.solution.velocity.x.array
+        pushes.append(problem.report.contact_forces[0][1])
+        change = (integral(1e-5 * above * now[1] * ufl.dx) - before) / tau
+        assert change == pytest.approx(pushes[-1], rel=1e-2, abs=1e-12)
+    assert max(pushes) > 1e-7

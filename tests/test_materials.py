@@ -202,10 +202,8 @@ def test_a_turn_does_not_change_a_finite_law():
 @pytest.mark.parametrize("form", ["volumes", "function", "UFL", "constant"])
 def test_two_steels_yield_each_by_its_own_law(kind, form, comm):
     """Bars beside each other, pulled alike: the stress of each is that of its own hardening."""
-    parts = [
-        ("soft", (0.0,) * 3, (1.0,) * 3, (2,) * 3),
-        ("hard", (0.0, 2, 0), (1.0, 3, 1), (2,) * 3),
-    ]
+    parts = [("soft", (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2, 2, 2))]
+    parts += [("hard", (0.0, 2.0, 0.0), (1.0, 3.0, 1.0), (2, 2, 2))]
     mesh, tags, names = boxes("tetrahedron", parts, comm)
     bars = {"soft": lambda x: x[1] < 1.5, "hard": lambda x: x[1] > 1.5}
     cut = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names, volumes=bars)

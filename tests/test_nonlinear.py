@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, held, stacked
+from bodies import boxes, drawn, held, stacked
 from dolfinx import fem
 from reference.nonlinear import above_plane, block, by_dolfinx, nearest_nodes
-from scenes import accepted, clamp, decomposed, integral, largest, unknowns
+from scenes import accepted, clamp, decomposed, integral, largest, measures, unknowns
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import SimplePlasticity, neo_hooke
@@ -229,6 +229,28 @@ def test_stress_of_a_bar_follows_its_hardening(comm):
         assert stress == pytest.approx(hard, abs=1e-9)
     stress, p = found[0.04]
     assert found[0.035] == pytest.approx((stress - 0.005 * E, p), abs=1e-9)
+
+
+def test_a_stiff_body_that_yields_beside_a_soft_one_is_as_right(comm):
+    """It moves 1e-3 of the other, or less, and does as if that were not there, to rtol."""
+    found, rtol = [], 1e-4
+    for names in ("a", "ab"):
+        parts = [(s, (2.0 * i, 0.0), (2.0 * i + 1.0, 1.0), (4, 4)) for i, s in enumerate(names)]
+        mesh, tags, sides = boxes("triangle", parts)
+        d = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=sides)
+        V, u, v, w = unknowns(d)
+        stiff = ufl.conditional(ufl.lt(ufl.SpatialCoordinate(d.mesh)[0], 1.5), 1e4, 1.0)
+        elastic = tfeti.Elasticity(d, E=stiff, nu=NU, model="plane_strain")
+        law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=0.05 * stiff)
+        F = law.residual(v)
+        for s in names:
+            F -= drawn(d, f"{s} top", (0.002, -0.02 if s == "a" else -0.005))(v, measures(d)[1])
+        bcs = [clamp(V, d.facets(f"{s} bottom")) for s in names]
+        more = {"state": law.state, "update": law.update, "petsc_options": {"rtol": rtol}}
+        accepted(tfeti.NonlinearContactProblem(F, u, bcs, [], d, J=law.tangent(w, v), **more))
+        found.append(largest(u.x.array[np.repeat(V.tabulate_dof_coordinates()[:, 0] < 1.5, 2)]))
+    assert found[1] < 1e-3 * largest(u.x.array)
+    assert found[1] == pytest.approx(found[0], rel=2.0 * rtol)
 
 
 def test_a_step_that_did_not_converge_is_not_accepted(comm):

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 import ufl
-from bodies import held
+from bodies import boxes, drawn, held
 from dolfinx import fem
 from panels import SPACE, polygon
 from scenes import accepted, apart, clamp, decomposed, hooke, largest, strain, vectors
@@ -471,16 +471,21 @@ def test_a_tool_that_is_lifted_leaves_an_elastic_body_at_rest():
 
 
 def test_a_free_body_that_friction_has_held_is_let_go():
-    """Pressed between floor and lid, drawn along, let go, pressed again; stopped and resumed."""
+    """Pressed by a lid, drawn along, let go beside one with a load, pressed again; and resumed."""
     ways, floor = [(0.0, -0.1), (0.02, -0.1), (0.02, 0.1), (0.0, -0.1)], tfeti.Plane((0, 0), (0, 1))
     for cell, mu, shape in (("triangle", 0.5, top(2)), ("quadrilateral", 0.2, ball(2, offset=0.2))):
-        V, _, v = vectors(decomposition := decomposed(cell, 6, 4))
+        parts = [("a", (0.0, 0.0), (1.0, 1.0), (6, 6)), ("b", (2.0, 0.0), (3.0, 1.0), (3, 3))]
+        mesh, tags, names = boxes(cell, parts)
+        d = tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=names)
+        V, _, v = vectors(d)
         u, law, states, let_go = fem.Function(V), {"friction": tfeti.Coulomb(mu)}, {}, []
         lid = tfeti.RigidBody(shape, displacement=lambda t: ways[int(t)], name="lid")
-        tools = [tfeti.Obstacle("bottom", floor, **law), tfeti.Obstacle("top", lid, **law)]
+        tools = [("a bottom", floor), ("a top", lid), ("b bottom", floor)]
+        tools = [tfeti.Obstacle(*pair, **law) for pair in tools]
         F = ufl.derivative(neo_hooke(u, 1.0, 0.3) * ufl.dx, u, v)
+        F -= drawn(d, "b top", (0.0, -1e-6))(v, ufl.Measure("ds", subdomain_data=d.facet_tags))
         for begin in range(3):
-            problem = tfeti.NonlinearContactProblem(F, u, [], tools, decomposition, finite=True)
+            problem = tfeti.NonlinearContactProblem(F, u, [], tools, d, finite=True)
             problem.time = begin - 1.0
             if begin:
                 problem.restore(states[begin - 1])
@@ -488,8 +493,9 @@ def test_a_free_body_that_friction_has_held_is_let_go():
                 problem.time = float(t)
                 accepted(problem)
                 states[t] = problem.state()
-                forces = [problem.solution.contact(i).resultant.force for i in (0, 1)]
+                *forces, light = (problem.solution.contact(i).resultant.force for i in range(3))
                 assert largest(np.add(*forces)) <= 1e-9
+                assert largest(light[:2] - (0.0, 1e-6)) <= 1e-12
                 assert (largest(forces) <= 1e-12) == (t == 2)
                 if t == 2:
                     let_go.append(np.array(u.x.array))

@@ -474,9 +474,18 @@ class System(Generic[OwnForms]):
             self._take_rounding(self._subdomains)
 
     def _take_rounding(self, subdomains: Subdomains) -> None:
-        if self.forms.rounding is not None:
-            noise = self._dofs.to_primal(self.forms.rounding)
-            subdomains.load_rounding[: len(noise)] = noise
+        """Say what rounding is in loads, of bodies that have a given one none. Collective."""
+        if self.forms.rounding is None:
+            return
+        known = (self.forms.rounding, self.forms.given_loads)
+        rounding, given = (self._dofs.to_primal(values) for values in known)
+        subdomains.load_rounding[: len(rounding)] = rounding
+        parts = subdomains.dof_parts
+        (loaded,) = subdomains.of_bodies(
+            [[float(np.any(given[part])) for part in parts]], largest=True
+        )
+        for part, body in zip(parts, subdomains.body_of_block, strict=True):
+            subdomains.load_rounding[part] *= loaded[body] == 0.0
 
     def _factor(self) -> None:
         dofs, trace = self._dofs, self.gluing.constraints.trace

@@ -140,7 +140,12 @@ def measure(
         on_modes = coarse.terms(state.lam)
         most = on_modes.max()
         on_modes = np.maximum(on_modes, LIGHT * most)
-        apart = np.abs(coarse.G(state.lam) - coarse.e) - StoppingTolerances.noise * most
+        apart = np.abs(coarse.G(state.lam) - coarse.e)
+        if subdomains.num_springs:  # whose forces are those of u only as far as their rows hold
+            forces_missed = np.zeros(len(w))
+            forces_missed[sets.springs] = coarse.sigma * w[sets.springs]
+            apart = np.maximum(apart, np.abs(coarse.G(forces_missed)))
+        apart -= StoppingTolerances.noise * most
         worst = int(np.argmax(np.maximum(apart, 0.0) / np.maximum(on_modes, TINY)))
         balance, forces = float(max(apart[worst], 0.0)), float(on_modes[worst])
     return Measures(

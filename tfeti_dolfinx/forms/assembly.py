@@ -57,9 +57,11 @@ class Forms:
             set.
         rounding: What rounding may have made of each entry of the last load, if that is more than
             a share of it; else None.
+        given_loads: Then the part of that load that is given, and known but for its own rounding.
     """
 
     rounding: Array | None = None
+    given_loads: Array
     _entries: la.MatrixCSR | None = None
     names: ClassVar[tuple[str, str]] = ("a", "L")
 

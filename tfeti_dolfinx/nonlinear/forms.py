@@ -15,7 +15,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.parallel import any_rank, least
+from tfeti_dolfinx.common.parallel import least
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -134,7 +134,7 @@ class NewtonForms(Forms):
         found = self._matrix @ u - self.at_model + dead
         rounding = ROUNDING * (abs(self._matrix) @ (abs(u) + self._length))
         found[abs(found) <= rounding] = 0.0
-        self.rounding = rounding * (not any_rank(self._decomposition.comm, dead))
+        self.rounding, self.given_loads = rounding, dead + np.zeros_like(found)
         return np.asarray(found - dead)
 
     def dead(self) -> Any:

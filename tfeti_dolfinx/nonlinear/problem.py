@@ -9,8 +9,8 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.common.agreement import agreeing
-from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering, summed
+from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sums
+from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
@@ -50,10 +50,11 @@ class NonlinearContactProblem(ContactProblem):
        Eisenstat and Walker.
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
-       gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0) is the remainder.
-    3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with a new model
-       of where the bodies are, or the last digit of that; in small strain where the remainder
-       times ‖d‖ is, which the next one is expected to be, and a tenth of ‖d‖.
+       gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0), of the part of d
+       that a body has, is its remainder.
+    3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm of each body, in finite strain with a
+       new model of where the bodies are, or the last digit of that; in small strain where the
+       remainder times ‖d‖ is, which the next one is expected to be, and a tenth of ‖d‖.
     4. *Step.* u ← u + t d; whole steps in finite strain, where J is not the derivative of F, and
        where J is kept, are accelerated by Anderson's method. It begins anew at a shortened step.
 
@@ -202,22 +203,24 @@ class NonlinearContactProblem(ContactProblem):
                 ) from error
             self._counts.newton_steps += 1
             end = self._conforming(u, np.array(self.u.x.array))
-            d = end - u
-            size = largest(comm, d)
-            increment = size / max(largest(comm, end), TINY) if size > self._last_digit else 0.0
+            d, most = end - u, largest(comm, end)
+            increments = self._increments(d, end, max(first, most))
+            increment = float(increments.max(initial=0.0))
             # 2. line search
-            t, remainder = self._line_search(u, d)
-            asked = min(remainder, 1.0) * increment  # what the next one is expected to be
+            t, remainders = self._line_search(u, d)
+            # what the next one is expected to be
+            asked = float(np.max(np.minimum(remainders, 1.0) * increments, initial=0.0))
             # 3. end
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
-                asked = float(np.clip(remainder, tol.steepest, tol.flattest)) * increment
-                left = max(tol.safety * remainder, tol.steepest) * increment
-                short |= t == 1.0 and left <= exact
+                shares = np.clip(remainders, tol.steepest, tol.flattest)
+                asked = float(np.max(shares * increments, initial=0.0))
+                left = np.maximum(tol.safety * remainders, tol.steepest) * increments
+                short |= t == 1.0 and bool(np.all(left <= exact))
                 if increment > tol.slow * before:
                     asked = min(asked, tol.finer * rtol / self._forcing)
             before = increment
-            nothing = largest(comm, end) <= max(tol.nothing * first, self._least)
+            nothing = most <= max(tol.nothing * first, self._least)
             if nothing or (short and rtol <= exact):
                 self._set(end)
                 return
@@ -232,13 +235,25 @@ class NonlinearContactProblem(ContactProblem):
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
                     faster.past.clear()
                     self._set(u + d)
-            keeps = keeping.next(size, t, tol.near * exact * largest(comm, end))
+            keeps = keeping.next(increment * most, t, tol.near * exact * most)
             # old places leave a body that is let go a moment, which drives it
             forms.kept = keeping.kept = keeps and not np.any(self._let_go)
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
             f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
         )
+
+    def _increments(self, d: Array, end: Array, most: float) -> Array:
+        """Return the increment of each body over its displacement. Collective.
+
+        Less than rounding of the largest displacement, or of places, is none.
+        """
+        subdomains = self._system.subdomains
+        moved, size = subdomains.body_sizes(
+            [subdomains.with_rigid(self.dofs.to_primal(x)) for x in (d, end)]
+        )
+        moved -= max(self._tolerances.nothing * most, self._last_digit)
+        return np.where(size > self._least, np.maximum(moved, 0.0) / np.maximum(size, TINY), 0.0)
 
     def _conforming(self, u: Array, end: Array) -> Array:
         """Join the copies of nodes in finite strain, and let what is let go turn by finite angles.
@@ -340,44 +355,48 @@ class NonlinearContactProblem(ContactProblem):
             with raised_on_all_ranks(self.decomposition.comm), named("update"):
                 self._update()
 
-    def _line_search(self, u: Array, d: Array) -> tuple[float, float]:
-        """Go to u + t d, and return the length t in (0, 1] and |r(1)/r(0)|. Collective."""
-        tol, at_u = self._tolerances, self._system.forms.at_model
-        subdomains = self._system.subdomains
+    def _line_search(self, u: Array, d: Array) -> tuple[float, Array]:
+        """Go to u + t d, and return the length t in (0, 1], and |r(1)/r(0)| of bodies. Collective.
+
+        They are of each body's part of d, the length of all.
+        """
+        tol, subdomains = self._tolerances, self._system.subdomains
         primal = subdomains.with_rigid(self.dofs.to_primal(d))
-        diagonal = sum(
-            float(block.diagonal @ primal[part] ** 2) for block, part in subdomains.block_parts
-        )
-        comm, own = subdomains.comm, [sum(subdomains.energies(primal)), diagonal, at_u @ d]
-        energy, diagonal, slope = map(float, steering(comm, *summed(comm, np.array(own))))
-        start, rounding = -energy, tol.rounding * diagonal
-        forces = start - slope  # λᵀB d, since J d + F(u) + Bᵀλ = 0
-        b, high = self._longest(u, d, forces)
+        parts = subdomains.block_parts
+        diagonals = [float(block.diagonal @ primal[part] ** 2) for block, part in parts]
+        found = subdomains.of_bodies([subdomains.energies(primal), diagonals])
+        energies, rounding = bcast_from_root(subdomains.comm, found)
+        rounding *= tol.rounding
+        # λᵀB d, since J d + F(u) + Bᵀλ = 0
+        forces = -energies - self._works(self._system.forms.at_model, d)
+        b, slopes = self._longest(u, d, forces)
         # of a step that is rigid, or nearly, slopes are rounding and say nothing
-        remainder = abs(high / start) if abs(start) > rounding else 1.0
-        if high <= max(self._curvature * abs(start), rounding):
-            return b, remainder
-        a, low = 0.0, start
+        remainders = np.ones(len(energies))
+        np.divide(np.abs(slopes), energies, remainders, where=energies > rounding)
+        a, low, high = 0.0, float(-sum(energies)), float(sum(slopes))
+        enough = self._curvature * abs(low)
+        if high <= max(enough, sum(rounding)):
+            return b, remainders
         for _ in range(tol.max_line_search):  # regula falsi in Illinois' form
             t = b - high * (b - a) / (high - low)
-            slope = self._slope(u, d, t) + forces
-            if abs(slope) <= self._curvature * abs(start):
+            slope = float(sum(self._slopes(u, d, t) + forces))
+            if abs(slope) <= enough:
                 break
             if slope > 0.0:
                 b, high, low = t, slope, 0.5 * low
             else:
                 a, low, high = t, slope, 0.5 * high
-        return t, remainder
+        return t, remainders
 
-    def _longest(self, u: Array, d: Array, forces: float) -> tuple[float, float]:
+    def _longest(self, u: Array, d: Array, forces: Array) -> tuple[float, Array]:
         """Return the longest step that leaves no cell inside out, and r at its end. Collective."""
         t = 1.0
         while t >= self._tolerances.shortest:
             self._set(u + t * d)
             if self._places is None or self._places.smallest_volume_ratio() > 0.0:
-                slope = self._slope(u, d, t) + forces
-                if np.isfinite(slope):
-                    return t, slope
+                slopes = self._slopes(u, d, t) + forces
+                if np.all(np.isfinite(slopes)):
+                    return t, slopes
             t *= 0.5
         raise ConvergenceError(
             f"Newton's method: a step shortened to {t:.1e} still turns a cell inside out (det F "
@@ -385,11 +404,18 @@ class NonlinearContactProblem(ContactProblem):
             "are outside (is a normal turned?), and surfaces with the sides that roll onto a tool"
         )
 
-    def _slope(self, u: Array, d: Array, t: float) -> float:
-        """F(u + t d; d). Collective."""
+    def _slopes(self, u: Array, d: Array, t: float) -> Array:
+        """F(u + t d; d) of each body. Collective."""
         self._set(u + t * d)
         self._system.forms.known = F = self._system.forms.residual()
-        return dot_over(self.decomposition.comm, (F, d))[0]
+        return self._works(F, d)
+
+    def _works(self, F: Array, d: Array) -> Array:
+        """Fᵀd of each body, the same on all ranks. Collective."""
+        subdomains = self._system.subdomains
+        own = subdomains.with_rigid(self.dofs.to_primal(F * d))
+        (found,) = subdomains.of_bodies([sums(own, subdomains.dof_parts)])
+        return bcast_from_root(subdomains.comm, found)
 
     def update(
         self,
