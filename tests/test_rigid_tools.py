@@ -480,8 +480,8 @@ def test_a_free_body_that_friction_has_held_is_let_go():
         V, _, v = vectors(d)
         u, law, states, let_go = fem.Function(V), {"friction": tfeti.Coulomb(mu)}, {}, []
         lid = tfeti.RigidBody(shape, displacement=lambda t: ways[int(t)], name="lid")
-        tools = [("a bottom", floor), ("a top", lid), ("b bottom", floor)]
-        tools = [tfeti.Obstacle(*pair, **law) for pair in tools]
+        tools = [tfeti.Obstacle("a bottom", floor, **law), tfeti.Obstacle("a top", lid, **law)]
+        tools.append(tfeti.Obstacle("b bottom", floor))
         F = ufl.derivative(neo_hooke(u, 1.0, 0.3) * ufl.dx, u, v)
         F -= drawn(d, "b top", (0.0, -1e-6))(v, ufl.Measure("ds", subdomain_data=d.facet_tags))
         for begin in range(3):

@@ -199,7 +199,9 @@ class CoarseSpace(Coarse):
 
     def rows_driven(self, free: Motions) -> Array:
         """Return local rows that act on bodies which the load drives along free motions."""
-        motion = bcast_from_root(self.comm, self.bodies.driven(free, self.work(self.e)))
+        motion = None
+        if free.count:
+            motion = bcast_from_root(self.comm, self.bodies.driven(free, self.work(self.e)))
         if motion is None:
             return np.empty(0, dtype=np.int64)
         moved = np.any(motion.reshape(self.bodies.count, -1), axis=1)

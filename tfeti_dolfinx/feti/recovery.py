@@ -86,7 +86,7 @@ def recover(
         light = np.zeros(len(lam), dtype=bool)
         light[coarse.rows_driven(loose)] = True
         light &= (lam != 0.0) & ~borne
-        if not any_rank(coarse.comm, light):
+        if not loose.count or not any_rank(coarse.comm, light):
             return Recovered(np.array(lam), u, gap, residual, active, loose)
         borne |= light
 

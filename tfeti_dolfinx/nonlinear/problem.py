@@ -10,7 +10,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sums
-from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest
+from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
@@ -365,7 +365,7 @@ class NonlinearContactProblem(ContactProblem):
         parts = subdomains.block_parts
         diagonals = [float(block.diagonal @ primal[part] ** 2) for block, part in parts]
         found = subdomains.of_bodies([subdomains.energies(primal), diagonals])
-        energies, rounding = bcast_from_root(subdomains.comm, found)
+        energies, rounding = (steering(subdomains.comm, *of_bodies) for of_bodies in found)
         rounding *= tol.rounding
         # λᵀB d, since J d + F(u) + Bᵀλ = 0
         forces = -energies - self._works(self._system.forms.at_model, d)
@@ -415,7 +415,7 @@ class NonlinearContactProblem(ContactProblem):
         subdomains = self._system.subdomains
         own = subdomains.with_rigid(self.dofs.to_primal(F * d))
         (found,) = subdomains.of_bodies([sums(own, subdomains.dof_parts)])
-        return bcast_from_root(subdomains.comm, found)
+        return steering(subdomains.comm, *found)
 
     def update(
         self,
