@@ -53,7 +53,7 @@ def recover(
         gradient: Fλ − d up to the range of Gᵀ; on rows that the face does not hold it is ν.
         face: The face of λ.
         error: How large multipliers may be by the solver's error alone.
-        no_effect: Of that: a larger force of a normal counts.
+        no_effect: Of that: a larger force of a normal counts; a smaller one where it bears a load.
         damping: Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less would
             answer with their rounding over this share.
     """
