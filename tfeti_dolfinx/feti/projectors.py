@@ -19,6 +19,9 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteE
 
 # --- Gram matrices GGᵀ ------------------------------------------------------------------------
 
+# of the diagonal of GGᵀ, a square: a face with less of it holds that motion by rounding alone
+UNHELD = 1e-28
+
 
 class Grams:
     """GGᵀ, and GZ(GZ)ᵀ of faces; the part of gluing and Dirichlet rows is made once.
@@ -47,11 +50,12 @@ class Grams:
         row = np.repeat(np.arange(size), np.diff(whole.indptr))
         self._reached = np.searchsorted(row * size + whole.indices, reached)
         self._blocks = [(rows, G, np.searchsorted(reached, pairs)) for rows, G, pairs in parts]
-        everything = np.ones(Gt.shape[0], dtype=bool)
+        everything, self._unheld = np.ones(Gt.shape[0], dtype=bool), np.zeros(size)
         self.whole = self.of_face(Face(everything, np.full(len(everything), Status.FREE)))
+        self._unheld = UNHELD * self.whole.diagonal()
 
     def of_face(self, face: Face, damping: float = 0.0) -> csr_array:
-        """GZ(GZ)ᵀ + damping·GGᵀ, shape ``(r, r)``.
+        """GZ(GZ)ᵀ + damping·GGᵀ, shape ``(r, r)``, 0 for motions held by rounding alone.
 
         Of all rows anew where a set constrains others than ``bounded``.
         """
@@ -74,6 +78,10 @@ class Grams:
             data += damping * self.whole.data
         gram = copy(self._like)  # with the same pattern, which is not looked at again
         gram.data = data
+        held = gram.diagonal() > self._unheld
+        if not np.all(held):
+            both = np.repeat(held, np.diff(gram.indptr)) & held[gram.indices]
+            gram.data = np.where(both, data, 0.0)
         if tangents:
             count, width = face.tangents.shape
             each = rows_of(self.Gt, face.tangent_rows.ravel(), face.tangents.ravel())
