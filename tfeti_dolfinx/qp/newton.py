@@ -204,6 +204,7 @@ class NewtonIteration:
         norm: Estimate of ‖F‖; ᾱ is its inverse. rounding: What that may make of ‖g^P‖ alone.
         least: The last ‖g^P‖ that was half of the one before.
         idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
+        unbalanced: Whether the last end of step 3 was outside of Ω or did not fulfil Gλ = e.
         resume: Whether λ is where PCPG has stopped.
     """
 
@@ -215,7 +216,7 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
         self.pressed = qp.feasible.face(z.lam, z.g)
         self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.resume = 0, False
+        self.idle, self.resume, self.unbalanced = 0, False, False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
@@ -295,7 +296,8 @@ class NewtonIteration:
         taken = feasible and 0.5 * double >= enough - self.parameters.hidden * hidden
         self.resume = taken
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
-        self.solver.cautious = self.qp.cautious and rose and self.idle < 2
+        unbalanced, self.unbalanced = self.unbalanced and not feasible, not feasible
+        self.solver.cautious = self.qp.cautious and (unbalanced or (rose and self.idle < 2))
         if taken:
             self._go(end, 0.5 * double)
         if not taken and not looked:
@@ -335,7 +337,8 @@ class FaceSolver:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
-        cautious: Whether rows leave a flat face as they block, after a step in which q rose.
+        cautious: Whether rows leave a flat face as they block, after a step in which q rose, or
+            where two solves in a row have dropped so many that the others cannot balance the load.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
