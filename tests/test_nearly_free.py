@@ -136,6 +136,33 @@ def test_fits_are_released_beside_one_that_stays():
         assert p.report.F_multiplications <= 600
 
 
+@pytest.mark.parametrize("gap", [0.0, 1e-3])
+def test_a_light_pin_in_a_hole_bears_a_torque_up_to_its_angle_of_friction(gap):
+    """It rolls up the side of the hole by an angle whose sine is the torque over W r."""
+    parts = [((0, 0), 0.3, 1.0 - gap, 3, 40, 0.0, 1), ((0, 0), 1.0, 1.5, 2, 48, 0.0, 2)]
+    d = rings(parts, 4)
+    (x, y), torque = ufl.SpatialCoordinate(d.mesh), fem.Constant(d.mesh, 0.0)
+    pulls = ufl.as_vector((-torque * y / 0.09, torque * x / 0.09 - 1.0))
+
+    def load(v, ds):
+        return 1e-5 * ufl.dot(pulls, v) * ds(d.surface("in0"))
+
+    contact = tfeti.Contact("out0", "in1", friction=tfeti.Coulomb(0.3))
+    p = two_body_problem(d, load, lambda V: [clamp(V, d.facets("out1"))], [contact])
+    sine = 0.3 / np.hypot(1.0, 0.3) * (1.0 - gap)
+    for share in (0.0, -0.5, 0.9, 0.3):
+        torque.value = share * sine
+        p.solve()
+        borne = p.solution.contact(0).resultant
+        force, moment = borne.force[1], borne.moment[2]
+        assert abs(borne.force[0]) <= 1e-6 * force
+        assert moment / force == pytest.approx(-torque.value, abs=0.01 * sine)
+        assert p.report.F_multiplications <= 400
+    torque.value = 1.1 * sine
+    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION"):
+        p.solve()
+
+
 def test_a_ring_that_polygons_hold_by_a_little():
     """Its turn follows from the meshes: small normals' errors hold it, which is said."""
     turns, held = [], []

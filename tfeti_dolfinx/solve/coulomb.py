@@ -29,7 +29,7 @@ class CoulombParameters:
     """Parameters of a solve with Coulomb's law."""
 
     newton: FrictionParameters = DEFAULT  # those of Newton's method on the law
-    tries: int = 4  # how often that may end and its bounds not be at rest
+    tries: int = 4  # how often that may end and its bounds not be at rest; once where it has failed
     finer: float = 0.03  # factor on its target each time, and at least on its residual
     # its target at most, over the tolerance that a look leaves to a solve. Looks leave half of
     # what an answer needs (StoppingTolerances.aim), bar where a bound or a leap limits them
@@ -49,6 +49,9 @@ class CoulombParameters:
     shortest: float = 0.125  # of a step towards the forces found: bounds never take less of it
     # problems in a row whose forces are less than half of their bounds: these fall to 0
     falls: int = 2
+    # of the load of a body, over the number of its points: other bounds, the last one first. Their
+    # friction may bear what slides, but not all of the load, or points hang; then more of them
+    shares: tuple[float, ...] = (1000.0, 2.0, 4.0)
     # of all multipliers: forces of normals that rounding makes of none. As bounds they would be
     # discs that bend so much that nothing else is seen beside them
     no_force: float = 1e-13
@@ -141,8 +144,9 @@ def solve_with_friction(
         rtol *= 1.0 if moved else parameters.share
         start = law or (result.lam, result.mu)
         bounds.advance()
-        law = newton.solve(start, bounds, aim) if moved else None
+        law, found = newton.solve(start, bounds, aim) if moved else None, bounds.now
         motion, idle = None if law else bounds.hold(), bounds.idle > parameters.patience
+        start = start if bounds.now is found else None  # with other bounds anew
         if motion is not None or idle or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
@@ -193,7 +197,7 @@ class FrictionBounds:
         at = constraints.pressed
         self._rows = constraints.pressed_by[at]
         self._mu = np.linalg.norm(constraints.coefficients[at], axis=1)
-        self._stuck, self._rested, self._slipped = start is None, False, False
+        self._slipped, self._others = False, [*parameters.shares, *[np.inf][: start is not None]]
         self.now: Array = np.full(len(self._rows), np.inf)
         if start is not None:
             known = dual.pressures[at]
@@ -214,26 +218,28 @@ class FrictionBounds:
         """Set the present bounds, else others, each once; return a motion that they let go.
 
         Others are those of points that all stick. These may hang where they do not touch, which
-        tells no forces of normals: then those of a load that rests on one point.
+        tells no forces of normals: then those of points that share the load of a body.
         """
-        dual = self._dual
-        dual.bound_friction(self.now)
-        motion = None if self.stick else sliding_motion(dual.coarse, dual.constraints, dual.pulling)
-        if motion is None or self._rested:
-            return motion
-        if not self._stuck:
-            self.now, self._stuck = np.full(len(self._rows), np.inf), True
+        dual, first = self._dual, None
+        while True:
             dual.bound_friction(self.now)
-            return None
-        self.now, self._rested = self._at_rest(), True
-        dual.bound_friction(self.now)
-        lets_go = sliding_motion(dual.coarse, dual.constraints, dual.pulling) is not None
-        return motion if lets_go else None
+            motion = None
+            if not self.stick:
+                motion = sliding_motion(dual.coarse, dual.constraints, dual.pulling)
+            first = motion if first is None else first
+            if motion is None or not self._others:
+                return None if motion is None else first
+            self.now = self._at_rest(self._others.pop())
 
-    def _at_rest(self) -> Array:
-        """λ_N of points each of which bears the whole load of a body."""
+    def _at_rest(self, share: float) -> Array:
+        """λ_N of points each of which bears a share of the load of a body over their number."""
+        if np.isinf(share):
+            return np.full(len(self._rows), np.inf)
         coarse, weights = self._dual.coarse, np.zeros(self._constraints.num_rows)
         loads = coarse.bodies.loads * np.sqrt(coarse.bodies.nodes)
+        presses = np.isin(coarse.J.row, self._rows)
+        counts = np.bincount(coarse.J.body[presses], minlength=coarse.bodies.count)
+        loads = loads * share / np.maximum(summed(self._comm, counts.astype(float)), 1.0)
         np.maximum.at(weights, coarse.J.row, loads[coarse.J.body])
         return np.asarray((weights / coarse.row_size)[self._rows])
 
@@ -408,7 +414,7 @@ class NewtonOnLaw:
         self.steps, self._share = self.steps + steps, parameters.finer * self._share
         self.tries -= 1
         if end is None:
-            self.tries, dual.recycled = 0, self.recycled
+            self.tries, dual.recycled = min(self.tries, 1), self.recycled
             return None
         # F of the end stands for that of the nearest point of its set, where the problem begins
         Fx = end.s + qp.coarse.combined(end.mu) + qp.d
