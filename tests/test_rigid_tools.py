@@ -1,6 +1,7 @@
 """Rigid bodies that move by a law, or under a force: closed forms, statics, and each other."""
 
 import csv
+import dataclasses
 
 import numpy as np
 import pytest
@@ -88,8 +89,8 @@ def test_another_displacement_needs_neither_rows_nor_factors():
 @pytest.mark.parametrize("friction", [None, ROUGH])
 def test_a_force_moves_a_tool_as_far_as_its_displacement_has_needed(gdim, friction):
     scene, way = block(gdim), 0.03 * DOWN[gdim]
-    law = tfeti.RigidBody(ball(gdim), displacement=way, name="ball")
-    by_law = solved(scene, tfeti.Obstacle("top", law, friction=friction))
+    law = tfeti.Obstacle("top", ball(gdim), displacement=way, friction=friction, name="ball")
+    by_law = solved(scene, law)
     rounding = 1e-18  # as a vector has that was turned
     force = np.where(way != 0.0, -by_law.solution.tool("ball").resultant.force, rounding)
     axis = "xyz"[gdim - 1]
@@ -107,7 +108,7 @@ def test_an_eccentric_force_tilts_a_punch_as_in_closed_form(gdim):
     """σ = E(a + bx) along z of a block on rollers: u_z = (a + bx)z, u_x = −bz²/2, without ν.
 
     The force F at the eccentricity e within the core needs a = F/(EA) and b = Fe/(EI). Multipliers
-    have no linear pressure: an error of h².
+    have no linear pressure: an error of h². It may be given at a far point, with its moment.
     """
     scene = block(gdim, degree=2, n=8 if gdim == 2 else 4, hold="rollers", nu=0.0)
     force, e = 0.02, 0.1
@@ -132,7 +133,11 @@ def test_an_eccentric_force_tilts_a_punch_as_in_closed_form(gdim):
     law = tfeti.RigidBody(top(gdim), displacement=tool.displacement, rotation=turn, point=at)
     by_law = solved(scene, tfeti.Obstacle("top", law))
     assert np.isclose(by_law.solution.tool(0).resultant.force[-1], force, rtol=1e-8)
+    far, moment = [at[0] + 1e5, *at[1:]], 1e5 * force * (1.0 if gdim == 2 else -np.eye(3)[1])
+    punch = dataclasses.replace(punch, point=far, moment=moment)
+    by_far = solved(scene, tfeti.Obstacle("top", punch))
     assert same(problem, by_law)
+    assert same(problem, by_far, 1e-7)
 
 
 def test_one_tool_on_two_surfaces_has_the_statics_of_a_beam():
@@ -184,12 +189,11 @@ def test_motions_that_nothing_resists_or_drives_are_free():
 
 def test_a_far_tool_falls_until_it_touches():
     scene = block(2)
-    near, far = ball(2), tfeti.Sphere((0.5, 2.7), 1.0)
-    given = {"force": 0.01 * DOWN[2], "free": ("y",)}
-    found = [
-        solved(scene, tfeti.Obstacle("top", tfeti.RigidBody(shape, **given)))
-        for shape in (near, far)
+    tools = [
+        tfeti.RigidBody(shape, force=0.01 * DOWN[2], free=("y",))
+        for shape in (ball(2), tfeti.Sphere((0.5, 2.7), 1.0))
     ]
+    found = [solved(scene, tfeti.Obstacle("top", tool)) for tool in tools]
     ways = [problem.solution.tool(0).displacement[1] for problem in found]
     assert np.isclose(ways[1], ways[0] - 0.7, rtol=1e-9)
     assert same(*found)
