@@ -547,6 +547,11 @@ def test_distance_from_a_mesh_is_that_of_its_body():
     ball = tfeti.SurfaceMesh((panels := SPACE["ball"](12)).x, panels.nodes)
     p = rng.standard_normal((3, 200))
     assert np.abs(ball.distance(p) - np.linalg.norm(p, axis=0) + 1.0).max() <= 0.02
+    # inside, below a vertex of a disc, no side is chosen
+    turn = np.stack((np.cos(angle := np.arange(60) * np.pi / 30), np.sin(angle)), axis=1)
+    lines = np.stack((np.arange(60), np.roll(np.arange(60), -1)), axis=1)
+    found = tfeti.SurfaceMesh(turn, lines).gradient(0.97 * np.pad(turn, ((0, 0), (0, 1))).T)
+    assert np.allclose(found[:2].T, turn, atol=1e-12)
 
 
 def test_a_mesh_presses_as_its_shape_does(tmp_path, comm):
