@@ -24,18 +24,25 @@ def solution(request):
     return p.solution
 
 
-def test_nodal_fields_share_the_displacement_s_element(solution):
+def test_values_at_points_do_not_depend_on_units(solution):
+    x, found = solution.decomposition.mesh.geometry.x, []
+    points = np.random.default_rng(1).uniform(size=(30, solution.dofs.bs))
+    for unit in (1.0, 1e-6):
+        x *= unit
+        found.append(solution.at(unit * points))
+        x /= unit
+    assert np.allclose(found[1].displacement, found[0].displacement, rtol=1e-9)
+    assert np.allclose(found[1].stress, found[0].stress, rtol=1e-9)
+
+
+def test_fields_of_nodes_and_cells(solution):
     names = [f.name for f in nodal_fields(solution)]
     assert names == ["displacement", "pressure", "gap", "status", "traction", "stress", "von_mises"]
     for f in nodal_fields(solution):
         assert f.function_space.element.basix_element.degree == 1
         assert np.all(np.isfinite(f.x.array))
-
-
-def test_cell_fields(solution):
     subdomain, body, material = cell_fields(solution)
-    d = solution.decomposition
-    assert np.array_equal(np.unique(subdomain.x.array), d.subdomains)
+    assert np.array_equal(np.unique(subdomain.x.array), solution.decomposition.subdomains)
     assert np.all(body.x.array == 0)
     assert np.all(material.x.array == -1)
 

@@ -10,7 +10,7 @@ from dolfinx import fem, geometry
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
-from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
+from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.contact_state import (
     ContactData,
@@ -41,13 +41,21 @@ from tfeti_dolfinx.forms.fields import (
     nodal,
     von_mises,
 )
-from tfeti_dolfinx.mortar.facets import facet_nodes, group_points, hat_integrals, surface_facets
+from tfeti_dolfinx.mortar.facets import (
+    diameter,
+    facet_nodes,
+    group_points,
+    hat_integrals,
+    surface_facets,
+)
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Displacement and stress at given points --------------------------------------------------
 
 # Of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
+# a length: how far it may be for DOLFINx, whatever the size of the mesh
+OF_DOLFINX = 1e-6
 
 
 @dataclass(frozen=True)
@@ -168,11 +176,16 @@ class Solution:
             given["points"] = points
         (k, d), x = points.shape, np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
         # cells of this rank, each with a point by its position
-        nodes = mesh.geometry.x
-        size = float(np.ptp(nodes, axis=0).max(initial=0.0)) if len(nodes) else 0.0
-        tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
-        near = geometry.compute_collisions_points(tree, x)
-        found = geometry.compute_colliding_cells(mesh, near, x)
+        nodes, unscaled = mesh.geometry.x, mesh.geometry.x.copy()
+        rounding = 4.0 * EPSILON * float(np.abs(nodes).max(initial=0.0))
+        scale = OF_DOLFINX / (PADDING * diameter(self.decomposition) + rounding)
+        try:
+            nodes *= scale
+            tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=OF_DOLFINX)
+            near = geometry.compute_collisions_points(tree, scale * x)
+            found = geometry.compute_colliding_cells(mesh, near, scale * x)
+        finally:
+            nodes[:] = unscaled
         place, cells = np.repeat(np.arange(k), np.diff(found.offsets)), np.asarray(found.array)
         # rows of each subdomain that has a point, added
         total = np.zeros((k, 1 + d + d * d))

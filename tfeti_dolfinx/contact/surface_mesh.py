@@ -11,6 +11,7 @@ from tfeti_dolfinx.common.arrays import Array, ArrayLike, sum_rows
 from tfeti_dolfinx.common.validation import checked_type, named, real_numbers
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.gmsh_model import open_model
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
 class SurfaceMesh:
@@ -118,6 +119,8 @@ class SurfaceMesh:
         apart = np.linalg.norm(p[point] - q, axis=1)
         order = np.lexsort((apart, point))
         best = order[np.concatenate(([0], np.cumsum(counts)[:-1]))]
+        tie = apart <= (apart[best] + 1e-9 * self._radius)[point]
+        mean = sum_rows(point[tie], (p[point] - q)[tie], len(p))
         q, weight, facet, apart = q[best], weight[best], facet[best], apart[best]
         # 3. the normal there, whose side says the sign
         normal, on = self._normal[facet].copy(), weight > 1e-9  # of a facet, an edge or a vertex
@@ -131,7 +134,11 @@ class SurfaceMesh:
         normal /= np.where(size > 0.0, size, 1.0)
         sign = np.where(np.sum((p - q) * normal, axis=1) < 0.0, -1.0, 1.0)
         far = apart > 1e-9 * self._radius
-        along = (p - q) / np.where(far, apart, 1.0)[:, None] * sign[:, None]
+        # between facets that are as near and turn by little, the mean: rounding would choose one
+        size = np.linalg.norm(mean, axis=1)
+        little = np.sum(mean * (p - q), axis=1) > SEARCH.edge * size * apart
+        along = np.where(little[:, None], mean, p - q) * sign[:, None]
+        along /= np.where(far, np.where(little, size, apart), 1.0)[:, None]
         return sign * apart, np.where(far[:, None], along, normal)
 
     def _closest(self, p: Array, facet: Array) -> tuple[Array, Array]:

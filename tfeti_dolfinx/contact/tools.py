@@ -8,13 +8,14 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.parallel import bcast_from_root, box_over_ranks
 from tfeti_dolfinx.contact.partner import GEOMETRY, ContactPartner, Obstacle
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.rigid_body import MOTIONS, Pose, RigidBody, motion_fields
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import diameter, surface_facets
+from tfeti_dolfinx.mesh.untorn import facet_points
+from tfeti_dolfinx.mortar.facets import surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
@@ -41,14 +42,16 @@ class Tools:
     """The rigid bodies that the contacts of a problem meet.
 
     They have one unknown for each free motion, a length: of a turn, its angle times the size of the
-    surface. All of them are on the last rank, behind the unknowns of its nodes. Creation raises an
-    InputError where bodies do not fit the space, or two have the same name. Creation is collective.
+    surface. Translations are those of the middle of the surface, since about a point that is far
+    off a turn is nearly a translation. All of them are on the last rank, behind the unknowns of its
+    nodes. Creation raises an InputError where bodies do not fit the space, or two have the same
+    name. Creation is collective.
 
     Attributes:
         bodies: The bodies, with their names.
         of_contact: Body of each contact, −1 without one.
         tool, mode: Body of each unknown, and its position in ``MOTIONS``.
-        scale: What a motion of size 1 is as an unknown.
+        basis: Free motions by unknowns of size 1, shape ``(num_unknowns, num_unknowns)``.
         num_unknowns, num_local: Number of free motions of all bodies, and of those on this rank:
             all or none.
         unknowns: Of each body with free motions its unknowns.
@@ -66,26 +69,28 @@ class Tools:
         self.bodies: list[RigidBody] = []
         self.of_contact = np.full(len(contacts), -1)
         known: list[RigidBody] = []
-        lengths = list[float]()
+        boxes = list[list[tuple[Array, Array]]]()  # of the surfaces of each body
         for i, contact in enumerate(contacts):
             if not isinstance(contact, Obstacle) or not isinstance(contact.shape, RigidBody):
                 continue
             tool = contact.shape
             if dofs.bs != gdim or gdim == 1:
                 raise InputError(f"{contact.name}: a RigidBody needs displacements in 2D or 3D")
-            size = diameter(decomposition, surface_facets(decomposition, contact.surface))
+            facets = surface_facets(decomposition, contact.surface)
+            x = decomposition.mesh.geometry.x[facet_points(decomposition.mesh, facets).ravel()]
+            box = box_over_ranks(self._comm, x)
             if tool not in known:
                 known.append(tool)
                 name = tool.name or f"tool of surface {contact.surface!r}"
                 self.bodies.append(replace(tool, name=name))
                 self.bodies[-1].check_dimension(gdim, name)
-                lengths.append(size)
+                boxes.append([])
             self.of_contact[i] = known.index(tool)
-            lengths[known.index(tool)] = max(lengths[known.index(tool)], size)
+            boxes[known.index(tool)].append(box)
         names = [body.name for body in self.bodies]
         if len(set(names)) < len(names):
             raise InputError(f"rigid bodies have the names {names}; expected different ones")
-        self._sizes = lengths = bcast_from_root(self._comm, lengths)
+        self._sizes = [max(float(np.linalg.norm(high - low)) for low, high in own) for own in boxes]
         free = [body.indices(gdim) for body in self.bodies] if self.bodies else []
         count, k = len(self.bodies), len(MOTIONS.get(gdim, ()))
         self.tool = np.repeat(np.arange(count), [len(own) for own in free])
@@ -94,8 +99,13 @@ class Tools:
         self.num_local = self.num_unknowns if self._comm.rank == self._comm.size - 1 else 0
         self.unknowns = {int(i): np.flatnonzero(self.tool == i) for i in np.unique(self.tool)}
         self.free_names = [names[i] for i in self.unknowns]
-        turns = self.mode >= gdim
-        self.scale = np.where(turns, np.array([*lengths, 1.0])[self.tool], 1.0)
+        self.basis = np.zeros((self.num_unknowns, self.num_unknowns))
+        for i, own in self.unknowns.items():
+            moves, turns = own[self.mode[own] < gdim], own[self.mode[own] >= gdim]
+            middle = np.mean(boxes[i], axis=(0, 1))[:gdim] - self.bodies[i].centre(gdim)
+            by_turns = motion_fields(middle[None])[0, self.mode[turns]] / self._sizes[i]
+            self.basis[moves, moves], self.basis[turns, turns] = 1.0, 1.0 / self._sizes[i]
+            self.basis[np.ix_(moves, turns)] = -by_turns[:, self.mode[moves]].T
         self.law: Array = np.zeros((count, k))
         self.found: Array = np.zeros((count, k))
         self.loads: Array = np.zeros(self.num_unknowns)
@@ -119,7 +129,7 @@ class Tools:
             for body, values in zip(self.bodies, both, strict=True):
                 given[f"{body.name}: motion and load"] = values
         law, loads = bcast_from_root(self._comm, np.array(both).swapaxes(0, 1))
-        loads = loads[self.tool, self.mode] / self.scale
+        loads = self.basis.T @ loads[self.tool, self.mode]
         moved = np.any(law != self.law, axis=1)
         placed = moved & np.array([body.large for body in self.bodies])
         changed = {"load"} if np.any(loads != self.loads) else set()
@@ -163,13 +173,13 @@ class Tools:
             both = zip(self.begin, motions.reshape(self.law.shape), strict=True)
             self.begin = [replace(pose, motion=motion) for pose, motion in both]
         self.found[:] = 0.0
-        self.found[self.tool, self.mode] = self.at_begin() / self.scale
+        self.found[self.tool, self.mode] = self.basis @ self.at_begin()
 
     def at_begin(self) -> Array:
         """Return the unknowns where the load step began, shape ``(num_unknowns,)``."""
         both = [[pose.motion for pose in poses] for poses in (self.begin, self.poses)]
         began, placed = np.array(both).reshape(2, *self.law.shape)
-        return np.asarray(self.scale * (began - placed)[self.tool, self.mode])
+        return np.linalg.solve(self.basis, (began - placed)[self.tool, self.mode])
 
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""
@@ -184,7 +194,7 @@ class Tools:
         if self.num_unknowns:
             values = self._comm.bcast(values, root=self._comm.size - 1)
             self.found[:] = 0.0
-            self.found[self.tool, self.mode] = values / self.scale
+            self.found[self.tool, self.mode] = self.basis @ values
 
     def motion(self, records: ContactRecords, found: bool = False) -> Array:
         """Return displacements of bodies at conditions, shape ``(n, gdim)``; 0 without a body.
@@ -224,7 +234,8 @@ class Tools:
             for j in unknowns:
                 rows.append(own)
                 columns.append(np.full(len(own), j))
-                values.append(-fields[:, self.mode[j]] / self.scale[j])
+                along = self.basis[unknowns, j]
+                values.append(-np.einsum("nkg,k->ng", fields[:, self.mode[unknowns]], along))
         return RigidEntries(np.concatenate(rows), np.concatenate(columns), np.concatenate(values))
 
     def check_begin(self, contacts: Sequence[ContactPartner], records: ContactRecords) -> None:
