@@ -73,11 +73,12 @@ def test_kernels_are_those_of_whole_clusters(clustered):
 
 
 @pytest.mark.parametrize(
-    ("clusters", "options"), [(1, {"qp_type": "smalse"}), (3, {"pc_type": "lumped"}), (16, {})]
+    ("parts", "clusters", "options"),
+    [(4, 1, {"qp_type": "smalse"}), (4, 3, {"pc_type": "lumped"}), (4, 16, {}), (1, 1, {})],
 )
-def test_the_answer_is_the_same(clusters, options):
-    u, plain = solved(square(8, 4, rtol=1e-9, **options))
-    v, report = solved(square(8, 4, rtol=1e-9, clusters=clusters, **options))
+def test_the_answer_is_the_same(parts, clusters, options):
+    u, plain = solved(square(8, parts, rtol=1e-9, **options))
+    v, report = solved(square(8, parts, rtol=1e-9, clusters=clusters, **options))
     assert apart(v, u) <= 1e-7
     assert report.converged_reason == "CONVERGED_RTOL"
     assert report.kernel_dim <= plain.kernel_dim

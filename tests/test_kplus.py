@@ -49,12 +49,9 @@ def test_a_generalised_inverse(cell, degree, kernel, n):
     b.destroy()
 
 
-def test_published_checks_hold():
+def test_published_checks_hold_and_find_what_is_wrong():
     check_kind_of_inverse(regularised)
     check_kind_of_block(SparseBlock)
-
-
-def test_an_inverse_of_one_s_own_can_be_checked():
     check_kind_of_inverse(DensePinv)
 
     class Crooked(DensePinv):
@@ -65,12 +62,17 @@ def test_an_inverse_of_one_s_own_can_be_checked():
         check_kind_of_inverse(Crooked)
 
 
-def test_a_negative_energy_is_found():
-    K, x = subdomain("quadrilateral")
+def test_a_negative_energy_is_found_in_a_matrix_of_symmetric_pattern():
+    K, x = stiffness("quadrilateral")
     R = kernel_of(K, candidate_modes(x, 2, x.mean(axis=0), 1.0))
-    bad = K.toarray()
-    values, vectors = np.linalg.eigh(bad)
+    fixing = fixing_dofs(x, np.arange(K.shape[0]) // 2)
+    values, vectors = np.linalg.eigh(bad := K.toarray())
     softest = vectors[:, R.shape[1]]
     bad -= 2.0 * values[R.shape[1]] * np.outer(softest, softest)
     with pytest.raises(NotPositiveDefiniteError):
-        regularised(csr_array(bad), R, fixing_dofs(x, np.arange(K.shape[0]) // 2))
+        regularised(csr_array(bad), R, fixing)
+    # rounding that leaves 0 in one triangle alone: a factor of PETSc's own would hang
+    K[0, 2], found = 0.0, list[csr_array]()
+    regularised(K, R, fixing, factor=lambda A, _: found.append(csr_array(A.csr())))
+    found[0].data[:] = 1.0
+    assert abs(found[0] - found[0].T).max() == 0.0

@@ -1,6 +1,7 @@
 """Options: parsing, precedence, ranges, documents."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from scenes import STAGES, decomposed, problem
 from tfeti_dolfinx import InputError
 from tfeti_dolfinx.common.validation import parameters_of
 from tfeti_dolfinx.options import Options, factor_options, parse_options
+from tfeti_dolfinx.solve.solver import resolved
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -33,8 +35,11 @@ def test_the_command_line_beats_the_dictionary():
 
 
 def test_named_mechanisms_are_switched_off():
-    options = parse_options({"tfeti_without": "d_scaling, recycled_directions"}, "tfeti_")
-    assert options.without == ("d_scaling", "recycled_directions")
+    options = parse_options({"without": "d_scaling, recycled_directions,late_schur"}, "tfeti_")
+    assert options.without == ("d_scaling", "recycled_directions", "late_schur")
+    for given, taken in (("auto", "dirichlet"), ("lumped", "lumped")):
+        assert resolved(replace(options, pc_type=given), (1, 0), "tfeti_").pc_type == taken
+    assert resolved(replace(options, qp_type="smalse"), (1, 0), "tfeti_").pc_type == "none"
     assert (options.scaling, options.recycle) == ("multiplicity", 0)
 
 

@@ -52,7 +52,6 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "d_scaling": {"scaling": "multiplicity"},
     "recycled_directions": {"recycle": 0},
     "newton_on_coulomb": {"friction_type": "fixed_point"},
-    "late_schur": {"pc_type": "dirichlet"},
 }
 
 

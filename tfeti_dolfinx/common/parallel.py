@@ -94,9 +94,11 @@ def joined_over(comm: MPI.Intracomm, own: Array) -> Array:
 
 def rows_over(comm: MPI.Intracomm, own: Any) -> Entries:
     """Return the rows of all ranks' CSR matrices, one after the other. Collective."""
-    table = np.concatenate(([0], np.cumsum(joined_over(comm, np.diff(own.indptr)))))
-    data, indices = (joined_over(comm, part) for part in (own.data, own.indices))
-    return Entries(data, indices, table, (len(table) - 1, own.shape[1]))
+    # ranks may have indices of 32 or 64 bits
+    integers = (part.astype(np.int64) for part in (np.diff(own.indptr), own.indices))
+    counts, indices = (joined_over(comm, part) for part in integers)
+    table = np.concatenate(([0], np.cumsum(counts)))
+    return Entries(joined_over(comm, own.data), indices, table, (len(table) - 1, own.shape[1]))
 
 
 class Exchange:

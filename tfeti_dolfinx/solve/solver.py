@@ -73,6 +73,8 @@ def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
             f"-{prefix}pc_type {options.pc_type}: {qp_type.upper()} takes no preconditioner; "
             "expected auto or none"
         )
+    if "late_schur" in options.without and own == "auto":
+        own = "dirichlet"
     pc_type = own if options.pc_type == "auto" else options.pc_type
     friction = options.friction_type
     if friction == "auto":

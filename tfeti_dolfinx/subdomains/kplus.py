@@ -10,7 +10,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array, Entries, plus
+from tfeti_dolfinx.common.arrays import TINY, Array, plus
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.mixed import MIXED, MixedFactor, cholmod
 
@@ -78,11 +78,7 @@ def regularised(
     added = K.diagonal()[moves].max() * (Q @ Q.T)
     count = len(fixing_dofs)
     row, column = np.repeat(fixing_dofs, count), np.tile(fixing_dofs, count)
-    whole = plus(K, row, column, added.ravel())
-    if not (kept := whole.data != 0.0).all():
-        table = np.concatenate(([0], np.cumsum(kept)))[whole.indptr]
-        whole = Entries(whole.data[kept], whole.indices[kept], table, K.shape)
-    return factor(whole, prefix)
+    return factor(plus(K, row, column, added.ravel()), prefix)
 
 
 @dataclass
