@@ -64,11 +64,14 @@ class Group:
         times = choice.multiplications * (2 if self.stiffness and self.columns == 1 else 1)
         return times * (once - dense) > self.work * self.size
 
+    def take_dense(self, A: Array) -> None:
+        """Apply a dense A, which is exact."""
+        self.dense, self.rough = A, None
+        self.apply = partial(dsymv if self.columns == 1 else dsymm, 1.0, A)
+
     def mult(self, w: Array, out: Array, roughly: bool = False) -> None:
         """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
         apply = self.rough if roughly and self.rough is not None else self.apply
-        if self.dense is not None:
-            apply = partial(dsymv if self.columns == 1 else dsymm, 1.0, self.dense)
         if isinstance(self.where, slice):
             out[self.where] = apply(w[self.where])
             return
@@ -121,7 +124,8 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     rows = [block.trace_rows for block, _ in equal]
     group = _group(equal, rows, len(traced.trace), traced.apply_schur, 0.0)
     if traced.schur is not None:
-        return replace(group, dense=traced.schur)
+        group.take_dense(traced.schur)
+        return group
     group.work = 2.0 * traced.stiffness.count
     if traced.inner is not None:
         group.work += 4.0 * (traced.coupling.count + traced.inner.entries)
@@ -214,11 +218,10 @@ class GroupedOperator:
             if group.dense is None and group.prefers_dense(self._choice):
                 A = _in_chunks(group.apply, np.eye(group.size, order="F"))
                 A += A.T  # symmetric to the last bit
-                group.dense = 0.5 * A
+                group.take_dense(0.5 * A)
                 if group.stiffness is not None:
                     group.stiffness.pinv_on = group.trace, group.dense
-            mixed = group.rough is not None and group.dense is None
-            form = "mixed" if mixed else "implicit" if group.dense is None else "explicit"
+            form = "mixed" if group.rough else "implicit" if group.dense is None else "explicit"
             self.forms["shared_" * (group.columns > 1) + form] += group.count
 
     @property
