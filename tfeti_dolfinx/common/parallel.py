@@ -59,7 +59,7 @@ def dot_over(comm: MPI.Intracomm, *pairs: tuple[Array, Array]) -> list[float]:
     products = np.array([x @ y for x, y in pairs])
     comm.Allreduce(MPI.IN_PLACE, products, op=MPI.SUM)
     comm.Bcast(products, root=0)
-    return list(products.tolist())
+    return [float(value) for value in products]
 
 
 def norm_over(comm: MPI.Intracomm, x: Array) -> float:

@@ -95,10 +95,10 @@ def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
     for count in np.unique(counts[counts > 0]):
         at = np.flatnonzero(counts == count)
         places = begins[at][:, None] + np.arange(count)
-        own, order = indices[places], np.lexsort(indices[places].T)
-        others = np.diff(own[order], axis=0).any(axis=1)
+        columns, order = indices[places], np.lexsort(indices[places].T)
+        others = np.diff(columns[order], axis=0).any(axis=1)
         for rows in np.split(order, np.flatnonzero(others) + 1):
-            pairs = (own[rows[0], :, None] * Gt.shape[1] + own[rows[0]]).ravel()
+            pairs = (columns[rows[0], :, None] * Gt.shape[1] + columns[rows[0]]).ravel()
             yield some[at[rows]], data[places[rows]], pairs
 
 
