@@ -38,7 +38,7 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     element = basix.create_element(basix.ElementFamily.P, cell, 1)
     middle = basix.geometry(cell).mean(axis=0)[None]
     slopes = element.tabulate(1, middle)[1:, 0, :, 0]
-    J = np.moveaxis(mesh.geometry.x.T[:gdim, corners] @ slopes.T, 2, 1)  # cells come last
+    J = np.moveaxis(mesh.geometry.x.T[:gdim, corners] @ slopes.T, 2, 1).copy()  # cells come last
     # J⁻¹ is the adjugate over the determinant, turned
     if gdim == 2:
         adjugate = J[::-1, ::-1] * [[[1.0], [-1.0]], [[-1.0], [1.0]]]

@@ -153,28 +153,14 @@ class LocalMatrix:
         # sums are those of scipy to the last bit, and so the same in any number of columns
         self._petsc.setOption(PETSc.Mat.Option.USE_INODES, False)
         self._x, self._y = self._petsc.createVecs()
-        self._columns: tuple[PETSc.Mat | None, PETSc.Mat | None] = None, None
 
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
         if x.ndim > 1:
-            return self._of_columns(x)
+            return of_columns(self._petsc.matMult, x, self.shape[0])
         self._x.setArray(x)
         self._petsc.mult(self._x, self._y)
         return np.array(self._y.array_r)
-
-    def _of_columns(self, x: Array) -> Array:
-        """A x, shapes ``(n, q)``, by dense matrices that are kept for the next q columns."""
-        if not x.size:
-            return np.zeros((self.shape[0], x.shape[1]))
-        given, made = self._columns
-        if given is None or given.getSize()[1] != x.shape[1]:
-            given, made = PETSc.Mat().createDense(x.shape, comm=PETSc.COMM_SELF), None
-            given.setUp()
-        given.getDenseArray()[:] = x
-        given.assemble()
-        self._columns = given, self._petsc.matMult(given, made)
-        return np.array(self._columns[1].getDenseArray(readonly=True), order="F")
 
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""

@@ -228,11 +228,10 @@ def check_placement(
         phi, gradient = distance_and_gradient(shape, x, what)
         nearest = np.argsort(np.abs(phi))[: SEARCH.samples]
         x, gradient, step = x[nearest], gradient[nearest, :gdim], SEARCH.difference * size
-        ahead, behind = (
-            [distance_and_gradient(shape, x + shift, what)[0] for shift in sign * np.eye(gdim)]
-            for sign in (step, -step)
-        )
-        slope = (np.array(ahead) - np.array(behind)).T / (2.0 * step)
+        shifts = step * np.vstack((np.eye(gdim), -np.eye(gdim)))
+        around, _ = distance_and_gradient(shape, (x + shifts[:, None]).reshape(-1, gdim), what)
+        ahead, behind = around.reshape(2, gdim, len(x))
+        slope = (ahead - behind).T / (2.0 * step)
         lengths = np.linalg.norm(gradient, axis=1), np.linalg.norm(slope, axis=1)
         product = lengths[0] * lengths[1]
         known = np.isfinite(product) & (product > 0.0)

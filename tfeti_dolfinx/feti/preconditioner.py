@@ -185,17 +185,15 @@ class _OnFace:
         """M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
         on, moves, sizes = self._on_all, self._moves, self._sizes
         on.settle()
-        B, w, y, D = on.whole.B, on.work, on.jumps, on.weights
-        trace, size = w.getLocalSize(), len(D)
+        B, w, y = on.whole.B, on.work, on.jumps
+        trace, size = w.getLocalSize(), len(on.weights)
+        D, none = np.append(on.weights, np.ones(len(moves))), np.zeros(size - trace)
         solved = self._face.restricted if self._is_identity else self._solved
 
         def lifted() -> Array:  # B_Dᵀ y
             B.multTranspose(y, w)
-            out = np.zeros(size + len(moves))
-            out[:trace] = w.array_r
-            if self._bends:
-                out[size:] = self._springs.transposed(y.array_r)
-            return out
+            along = self._springs.transposed(y.array_r) if self._bends else moves
+            return np.concatenate((w.array_r, none, along))
 
         def put_jumps(v: Array) -> None:  # y = B_D v
             w.setArray(v[:trace])
@@ -206,10 +204,7 @@ class _OnFace:
         def without_jumps(v: Array) -> Array:  # H v
             put_jumps(v)
             y.setArray(solved(y.array_r))
-            out = -lifted()
-            out[:size] += v[:size] / D
-            out[size:] += v[size:]
-            return out
+            return v / D - lifted()
 
         def stiff(u: Array) -> Array:  # K u
             out = np.empty(len(u))

@@ -103,10 +103,10 @@ def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
     for count in np.unique(counts[counts > 0]):
         at = np.flatnonzero(counts == count)
         places = begins[at][:, None] + np.arange(count)
-        found, which = np.unique(indices[places], axis=0, return_inverse=True)
-        for k, columns in enumerate(found):
-            rows = np.flatnonzero(which.ravel() == k)
-            pairs = (columns[:, None] * Gt.shape[1] + columns).ravel()
+        columns, order = indices[places], np.lexsort(indices[places].T)
+        others = np.diff(columns[order], axis=0).any(axis=1)
+        for rows in np.split(order, np.flatnonzero(others) + 1):
+            pairs = (columns[rows[0], :, None] * Gt.shape[1] + columns[rows[0]]).ravel()
             yield some[at[rows]], data[places[rows]], pairs
 
 

@@ -147,6 +147,7 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
     Constants may be from any: they are numbers.
     """
     domain = decomposition.mesh.ufl_domain()
+    elsewhere = any(d != domain for d in extract_domains(expression))
     for term in unique_pre_traversal(expression):
         if not term._ufl_is_terminal_:
             continue
@@ -156,7 +157,9 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
                     f"{name}: {term} is a ufl.{kind.__name__}, which has no values; expected a "
                     f"dolfinx.fem.{expected.__name__}"
                 )
-        if not isinstance(term, ufl.Constant) and any(d != domain for d in extract_domains(term)):
+        if not elsewhere or isinstance(term, ufl.Constant):
+            continue
+        if any(d != domain for d in extract_domains(term)):
             what, how = f"{type(term).__name__} {term}", ""
             if isinstance(term, fem.Function):
                 what = f"function {term.name!r}"

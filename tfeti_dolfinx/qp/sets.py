@@ -101,8 +101,7 @@ class Face:
 
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
-        own = np.array(x, dtype=float)
-        own[~self.free] = 0.0
+        own = np.asarray((x.T * self.free).T)
         if len(self.tangents):
             own += self._along_tangents(x, np.ones(len(self.tangents)))
         return own

@@ -4,6 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -63,18 +64,21 @@ class Group:
         times = choice.multiplications * (2 if self.stiffness and self.columns == 1 else 1)
         return times * (once - dense) > self.work * self.size
 
+    def take_dense(self, A: Array) -> None:
+        """Apply a dense A, which is exact."""
+        self.dense, self.rough = A, None
+        self.apply = partial(dsymv if self.columns == 1 else dsymm, 1.0, A)
+
     def mult(self, w: Array, out: Array, roughly: bool = False) -> None:
         """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
         apply = self.rough if roughly and self.rough is not None else self.apply
         if isinstance(self.where, slice):
-            own = w[self.where]
-            out[self.where] = apply(own) if self.dense is None else dsymv(1.0, self.dense, own)
+            out[self.where] = apply(w[self.where])
             return
         flat = np.zeros(self.size * self.columns)
         flat[self.place] = w[self.where]
-        columns = flat.reshape((self.size, self.columns), order="F")
-        product = apply(columns) if self.dense is None else dsymm(1.0, self.dense, columns)
-        out[self.where] = product.ravel(order="F")[self.place]
+        shape = (self.size, self.columns) if self.columns > 1 else self.size
+        out[self.where] = apply(flat.reshape(shape, order="F")).ravel(order="F")[self.place]
 
 
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:
@@ -88,9 +92,7 @@ def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:
         elif len(block.trace_dofs):
             groups.append(_own_group(block, kind, part))
     if kind == "stiffness":
-        alone = [equal[0] for equal in members.values() if len(equal) == 1]
-        shared = [equal for equal in members.values() if len(equal) > 1]
-        return [*groups, *map(_stiffness_group, [alone, *shared] if alone else shared)]
+        return [*groups, _stiffness_group(list(chain(*members.values())))] if members else groups
     return [*groups, *map(_pinv_group if kind == "pinv" else _schur_group, members.values())]
 
 
@@ -122,7 +124,8 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     rows = [block.trace_rows for block, _ in equal]
     group = _group(equal, rows, len(traced.trace), traced.apply_schur, 0.0)
     if traced.schur is not None:
-        return replace(group, dense=traced.schur)
+        group.take_dense(traced.schur)
+        return group
     group.work = 2.0 * traced.stiffness.count
     if traced.inner is not None:
         group.work += 4.0 * (traced.coupling.count + traced.inner.entries)
@@ -130,20 +133,16 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 
 
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
-    """K_bb of equal subdomains, or those of subdomains without equals as one sparse matrix."""
-    traces = {id(block.traced): block.traced for block, _ in blocks}.values()
-    rows = [block.trace_rows for block, _ in blocks]
-    if len(traces) == 1:
-        K_bb = next(iter(traces)).stiffness
-    else:
-        begins = np.cumsum([0, *(len(row) for row in rows)])
-        matrices = [traced.entries() for traced in traces]
-        columns = [a + K.indices for a, K in zip(begins, matrices, strict=False)]
-        table = np.cumsum(np.concatenate([[0], *(np.diff(K.indptr) for K in matrices)]))
-        data, shape = np.concatenate([K.data for K in matrices]), (int(begins[-1]),) * 2
-        K_bb = LocalMatrix(Entries(data, np.concatenate(columns), table, shape))
-        rows = [np.concatenate([a + row for a, row in zip(begins, rows, strict=False)])]
-    group = _group(blocks, rows, K_bb.shape[0], K_bb.__matmul__, 2.0 * K_bb.count)
+    """K_bb of all subdomains as one sparse matrix, on one column."""
+    traces = {id(block.traced): block.traced.entries() for block, _ in blocks}
+    matrices = [traces[id(block.traced)] for block, _ in blocks]
+    begins = np.cumsum([0, *(K.shape[0] for K in matrices)])
+    columns = [a + K.indices for a, K in zip(begins, matrices, strict=False)]
+    table = np.cumsum(np.concatenate([[0], *(np.diff(K.indptr) for K in matrices)]))
+    data, size = np.concatenate([K.data for K in matrices]), int(begins[-1])
+    K_bb = LocalMatrix(Entries(data, np.concatenate(columns), table, (size, size)))
+    rows = [a + block.trace_rows for a, (block, _) in zip(begins, blocks, strict=False)]
+    group = _group(blocks, [np.concatenate(rows)], size, K_bb.__matmul__, 2.0 * K_bb.count)
     return replace(group, can_be_dense=False)
 
 
@@ -219,11 +218,10 @@ class GroupedOperator:
             if group.dense is None and group.prefers_dense(self._choice):
                 A = _in_chunks(group.apply, np.eye(group.size, order="F"))
                 A += A.T  # symmetric to the last bit
-                group.dense = 0.5 * A
+                group.take_dense(0.5 * A)
                 if group.stiffness is not None:
                     group.stiffness.pinv_on = group.trace, group.dense
-            mixed = group.rough is not None and group.dense is None
-            form = "mixed" if mixed else "implicit" if group.dense is None else "explicit"
+            form = "mixed" if group.rough else "implicit" if group.dense is None else "explicit"
             self.forms["shared_" * (group.columns > 1) + form] += group.count
 
     @property
