@@ -335,7 +335,7 @@ class FaceSolver:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
-        cautious: Whether rows leave a flat face as they block, after a step in which q rose.
+        cautious: Whether rows leave a face as they block, after a step in which q rose.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -378,7 +378,7 @@ class FaceSolver:
             out, stays = self._has_left(end), False
             if not out or self._steps.cg >= self._max_it:
                 break
-            if self.cautious and not self._curved:
+            if self.cautious:
                 z = self._blocked(z, end)
                 continue
             if (restored := self._restored(end)) is None:
@@ -415,12 +415,19 @@ class FaceSolver:
         return same
 
     def _blocked(self, z: Point, end: Point) -> Point:
-        """Go towards the end just past the first bound, and enter the face there."""
-        qp, way = self._qp, end.lam - z.lam
-        length = min(least(qp.coarse.comm, qp.feasible.max_step(z.lam, -way)), 1.0)
-        on = qp.feasible.project(z.lam + (1.0 + self._parameters.past) * length * way)
-        z = Point(on, z.g + length * (end.g - z.g))
-        self._enter(qp.feasible.face(on, z.g))
+        """Go towards the end just past the first bound, and enter the face there.
+
+        Rows that slip follow their tangents all the way.
+        """
+        assert self._face is not None
+        qp, way, slips = self._qp, end.lam - z.lam, self._face.status == Status.SLIP
+        bound = qp.feasible.max_step(z.lam, -np.where(slips, 0.0, way))
+        length = min(least(qp.coarse.comm, bound), 1.0)
+        to = z.lam + (1.0 + self._parameters.past) * length * way
+        to = np.where(slips, to, qp.feasible.project(to))
+        z = Point(to, z.g + length * (end.g - z.g))
+        s = z.g - qp.coarse.combined(self.coarse.coordinates(z.g))
+        self._enter(qp.feasible.face(to, s))
         return z
 
     def _restored(self, end: Point) -> Point | None:
