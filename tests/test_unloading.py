@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import drawn, held, sided, stacked, two_body_problem
+from bodies import boxes, drawn, held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
 from reference.untorn import on_plane, untorn_box
 from scenes import clamp, decomposed, displacement, forms, hooke
@@ -257,6 +257,24 @@ def test_a_body_at_rest_behind_an_open_gap_does_not_limit_that_either(friction, 
         return displacement(p)[1]
 
     check_small_loads(solve, options["rtol"], (1.0, 1e-3, 1e-5, 2.8e-11, 1e-13))
+    p.destroy()
+
+
+def test_given_friction_of_a_load_that_falls():
+    """Rows that stick leave an active set with rows that slip one by one, too, where q rose."""
+    lower = "lower", (0, 0, -3.4), (5, 2.9, 0), (3, 3, 1)
+    upper = "upper", (-0.2, 0.9, 0.2), (2.6, 3.2, 4.6), (3, 1, 1)
+    mesh, tags, names = boxes("hexahedron", [lower, upper])
+    d = tfeti.decompose(mesh, 2, facet_tags=tags, surfaces=names)
+    load = fem.Constant(d.mesh, np.zeros(3))
+    bcs = held(d, "lower bottom", "lower left", "lower front", "upper front")
+    contact = sided("upper bottom", "lower top", friction=tfeti.Tresca(1e-4))
+    given = drawn(d, "upper top", load), bcs, [contact]
+    p = two_body_problem(d, *given, stress=stiffer_above(d, 20.0), max_it=100)
+    for factor in (1.0, 0.4):
+        load.value[:] = factor * np.array([2e-5, -3e-5, -2e-4])
+        p.solve()
+    assert p.report.F_multiplications <= 40
     p.destroy()
 
 

@@ -337,8 +337,7 @@ class FaceSolver:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
-        cautious: Whether rows leave a flat face as they block, after a step in which q rose, or
-            where two solves in a row have dropped so many that the others cannot balance the load.
+        cautious: Whether rows leave as they block, after q rose, or two ends did not balance.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -356,6 +355,7 @@ class FaceSolver:
         self.directions = Directions(qp)
         self.directions.norm = qp.seen
         self._face: Face | None = None
+        self._status = np.zeros(len(qp.d), dtype=np.int64)
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
         self.cautious, self.rounds = False, 0
         self.excluding: Array | None = None
@@ -381,7 +381,7 @@ class FaceSolver:
             out, stays = self._has_left(end), False
             if not out or self._steps.cg >= self._max_it:
                 break
-            if self.cautious and not self._curved:
+            if self.cautious:
                 z = self._blocked(z, end)
                 continue
             if (restored := self._restored(end)) is None:
@@ -407,7 +407,8 @@ class FaceSolver:
             return True
         self._steps.faces += not same
         slips = ~face.held & (face.status == Status.SLIP)
-        self._face, self._curved = face, any_rank(qp.coarse.comm, slips)
+        self._face, self._status = face, face.status
+        self._curved = any_rank(qp.coarse.comm, slips)
         self.coarse = qp.coarse.on_face(face)
         self._on_face = replace(qp, coarse=self.coarse, held=face.held, preconditioner=None)
         if self._curved:
@@ -418,12 +419,14 @@ class FaceSolver:
         return same
 
     def _blocked(self, z: Point, end: Point) -> Point:
-        """Go towards the end just past the first bound, and enter the face there."""
-        qp, way = self._qp, end.lam - z.lam
-        length = min(least(qp.coarse.comm, qp.feasible.max_step(z.lam, -way)), 1.0)
-        on = qp.feasible.project(z.lam + (1.0 + self._parameters.past) * length * way)
-        z = Point(on, z.g + length * (end.g - z.g))
-        self._enter(qp.feasible.face(on, z.g))
+        """Go towards the end just past the first bound of rows that do not slip, onto its face."""
+        qp, way, slips = self._qp, end.lam - z.lam, self._status == Status.SLIP
+        bound = qp.feasible.max_step(z.lam, -np.where(slips, 0.0, way))
+        length = min(least(qp.coarse.comm, bound), 1.0)
+        to = z.lam + (1.0 + self._parameters.past) * length * way
+        to = np.where(slips, to, qp.feasible.project(to))
+        z = Point(to, z.g + length * (end.g - z.g))
+        self._enter(qp.feasible.face(to, z.g - qp.coarse.combined(self.coarse.coordinates(z.g))))
         return z
 
     def _restored(self, end: Point) -> Point | None:
@@ -437,9 +440,8 @@ class FaceSolver:
 
     def _has_left(self, z: Point) -> bool:
         """Return whether rows that do not slip are outside of Ω."""
-        assert self._face is not None
         apart = self._qp.feasible.project(z.lam) - z.lam
-        return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._face.status != Status.SLIP))
+        return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._status != Status.SLIP))
 
     def _along_null_space(self, z: Point) -> Point:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
@@ -448,7 +450,6 @@ class FaceSolver:
         on each other want gaps that exclude each other: ``excluding`` says so.
         """
         own, qp, given = self.directions, self._qp, self._parameters
-        assert self._face is not None
         for way in (own.p, own.r):
             size, Fw = largest(qp.coarse.comm, way), qp.F(way)
             curvature, square = qp.dot((way, Fw), (way, way))
@@ -457,7 +458,7 @@ class FaceSolver:
             way, Fw = self._unseen(way, Fw)
             # to the first bound, maybe infinite; rounding ends no way
             small = given.rounding * largest(qp.coarse.comm, way)
-            moves = (self._face.status != Status.SLIP) & (np.abs(way) > small)
+            moves = (self._status != Status.SLIP) & (np.abs(way) > small)
             bound = qp.feasible.max_step(z.lam, -np.where(moves, way, 0.0))
             length = least(qp.coarse.comm, max(bound, 0.0))
             if np.isfinite(length):
