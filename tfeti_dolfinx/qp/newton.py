@@ -355,9 +355,8 @@ class FaceSolver:
         self.directions = Directions(qp)
         self.directions.norm = qp.seen
         self._face: Face | None = None
-        self._status = np.zeros(len(qp.d), dtype=np.int64)
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
-        self.cautious, self.rounds = False, 0
+        self._status, self.cautious, self.rounds = np.zeros(len(qp.d)), False, 0
         self.excluding: Array | None = None
         self.left = np.inf
 
