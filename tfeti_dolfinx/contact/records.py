@@ -159,10 +159,8 @@ def conditions(
     vertices, areas = integrals.vertices, area[chosen]
     # what rounding of coordinates may make of a gap
     rounding = SEARCH.no_gap * largest(dofs.comm, dofs.V.mesh.geometry.x)
-    gap, spread = curved_gap, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen, rounding)
-    if integrals.curved_gap is not integrals.gap:
-        own = integrals.curved_gap
-        curved_gap, spread = _mean_gaps(dofs, vertices, own, areas, chosen, rounding)
+    gap, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen, rounding)
+    curved_gap, spread = _mean_gaps(dofs, vertices, integrals.curved_gap, areas, chosen, rounding)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, integrals.entries)
