@@ -45,7 +45,7 @@ MECHANISMS = {
     "late_schur": "steps of the lumped preconditioner, where subdomains are large, until S pays",
     "foundation": "a first point of rigid bodies on springs, not the lightest forces that balance",
     "mixed_precision": "factors of large subdomains in space in single precision, with refinement",
-    "cautious": "constraints leave an active set one by one after a step that raised the energy",
+    "cautious": "constraints leave one by one after steps that raised the energy or lost balance",
 }
 # those that an option of their own switches off
 SWITCHES: dict[str, dict[str, Any]] = {

@@ -63,7 +63,8 @@ class QP:
     held: Array | None = None
     # whether a direction of PCPG is made conjugate to all before it, not the last alone
     keeps: bool = True
-    # whether rows leave a face one by one after a step in which all together have raised q
+    # whether rows leave a face one by one after a step in which all together have raised q, or
+    # two in which what was left did not balance the load
     cautious: bool = True
     # forces of a rank's rows if each were a spring that its gap presses, as stiff as bodies are
     # where so many rows carry together; None: unknown

@@ -49,9 +49,9 @@ class CoulombParameters:
     shortest: float = 0.125  # of a step towards the forces found: bounds never take less of it
     # problems in a row whose forces are less than half of their bounds: these fall to 0
     falls: int = 2
-    # of the load of a body, over the number of its points: other bounds, the last one first. Their
-    # friction may bear what slides, but not all of the load, or points hang; then more of them
-    shares: tuple[float, ...] = (1000.0, 2.0, 4.0)
+    # of the load of a body, over the number of its points: other bounds, one after the other. Their
+    # friction may bear what slides, but not all of the load, or points hang; at last it may
+    shares: tuple[float, ...] = (4.0, 2.0, 1000.0)
     # of all multipliers: forces of normals that rounding makes of none. As bounds they would be
     # discs that bend so much that nothing else is seen beside them
     no_force: float = 1e-13
@@ -144,7 +144,8 @@ def solve_with_friction(
         rtol *= 1.0 if moved else parameters.share
         start = law or (result.lam, result.mu)
         bounds.advance()
-        law, found = newton.solve(start, bounds, aim) if moved else None, bounds.now
+        law = newton.solve(start, bounds, aim) if moved else None
+        found = bounds.now
         motion, idle = None if law else bounds.hold(), bounds.idle > parameters.patience
         start = start if bounds.now is found else None  # with other bounds anew
         if motion is not None or idle or iterations >= options.friction_max_it:
@@ -197,7 +198,9 @@ class FrictionBounds:
         at = constraints.pressed
         self._rows = constraints.pressed_by[at]
         self._mu = np.linalg.norm(constraints.coefficients[at], axis=1)
-        self._slipped, self._others = False, [*parameters.shares, *[np.inf][: start is not None]]
+        self._slipped = False
+        stuck = [] if start is None else [np.inf]
+        self._others = [*stuck, *parameters.shares]
         self.now: Array = np.full(len(self._rows), np.inf)
         if start is not None:
             known = dual.pressures[at]
@@ -229,10 +232,10 @@ class FrictionBounds:
             first = motion if first is None else first
             if motion is None or not self._others:
                 return None if motion is None else first
-            self.now = self._at_rest(self._others.pop())
+            self.now = self._at_rest(self._others.pop(0))
 
     def _at_rest(self, share: float) -> Array:
-        """λ_N of points each of which bears a share of the load of a body over their number."""
+        """λ_N of points that bear a share of the load of a body over their number; ∞: all stick."""
         if np.isinf(share):
             return np.full(len(self._rows), np.inf)
         coarse, weights = self._dual.coarse, np.zeros(self._constraints.num_rows)
