@@ -199,7 +199,7 @@ def check_stiffness(
     name: str,
     K: Any,
     what: str = "the stiffness",
-    form: str = "a linear elastic form, or the tangent of an energy",
+    form: str = "a linear elastic form over all cells, or the tangent of an energy",
     symmetry: float = 1e-8,
     product: LocalMatrix | None = None,
 ) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -151,8 +152,9 @@ def _located(
     locate = dmesh.locate_entities_boundary if facets else dmesh.locate_entities
     for name in mesh.comm.bcast(list(markers)):  # ranks may order them differently
         marker = markers[name]
+        flags = partial(_flags, f"{what}[{name!r}]", marker)
         with raised_on_all_ranks(mesh.comm), named(f"{what}[{name!r}]"):
-            found = locate(mesh, dim, marker)
+            found = locate(mesh, dim, flags)
         if not any_rank(mesh.comm, len(found) > 0):
             where = "facet of the boundary" if facets else "cell"
             raise InputError(f"{what}[{name!r}]: the marker finds no {where}")
@@ -168,6 +170,17 @@ def _located(
         values[found], names[name] = tag, tag
     indices = np.flatnonzero(values != NO_TAG).astype(np.int32)
     return names, dmesh.meshtags(mesh, dim, indices, values[indices])
+
+
+def _flags(name: str, marker: Marker, x: Array) -> Array:
+    """Return the flags of a marker, which DOLFINx would take from numbers, too."""
+    flags = np.asarray(marker(x))
+    if flags.dtype != bool or flags.shape != x.shape[1:]:
+        raise InputError(
+            f"{name}: the marker returns {flags.dtype} of shape {flags.shape}; "
+            f"expected bool of shape {x.shape[1:]}, a flag for each point"
+        )
+    return flags
 
 
 def _checked_mesh(mesh: Any) -> dmesh.Mesh:
