@@ -118,7 +118,6 @@ def test_more_clusters_than_subdomains():
     p = square(8, 2, clusters=5)
     with pytest.raises(InputError, match="5 clusters of 4 subdomains; expected at most"):
         p.solve()
-    p.destroy()
 
 
 def test_averages_that_rounding_makes_dependent_are_named():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bodies import drawn, gathered, held, pressed, stacked, two_body_problem
 from dolfinx import fem
-from scenes import decomposed, problem, vectors
+from scenes import decomposed, problem, solved, vectors
 
 import tfeti_dolfinx as tfeti
 from meshes import half_ball, half_cylinder
@@ -97,8 +97,7 @@ def test_a_reaction_is_the_force_of_the_stress(comm):
     """A bar that is stretched: E ε on its end, friction of the floor beside it."""
     d = decomposed("quadrilateral", 4, 4)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), friction=tfeti.Tresca(0.01))
-    p = problem(d, traction=(0.02, -0.05), contacts=[floor], rtol=1e-10)
-    p.solve()
+    p = solved(problem(d, traction=(0.02, -0.05), contacts=[floor], rtol=1e-10))
     friction = p.solution.contact().resultant
     reaction = p.solution.reaction("left")
     assert np.allclose(reaction.force + friction.force, (-0.02, 0.05), rtol=0, atol=1e-8)

@@ -7,7 +7,7 @@ import pytest
 import ufl
 from bodies import held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
-from scenes import CELLS, curved_obstacle, decomposed, problem
+from scenes import CELLS, curved_obstacle, decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.solve.solver import solve_dual
@@ -71,8 +71,7 @@ def exact(p):
     "seed", [pytest.param(s, marks=[] if s < 12 else [pytest.mark.slow]) for s in range(50)]
 )
 def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
-    p = drawn(seed)
-    p.solve()
+    p = solved(drawn(seed))
     reported = p.report.residuals["energy_error"]
     assert reported <= p.report.tolerances["energy_error"]
     found, error = p.estimate(), norm(p, p.solution.u - exact(p))
@@ -84,7 +83,6 @@ def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
     if p.options.qp_type == "newton":
         # of Newton's iterates on friction: ψ|q| − τᵀq of a long slip q is far above ½‖u − u*‖²_K
         assert reported * size <= 2 * found.algebraic + 1e-11 * size
-    p.destroy()
 
 
 def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says():
@@ -92,8 +90,7 @@ def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says():
     floor = tfeti.Obstacle("bottom", curved_obstacle(2), reach=0.2)
     bounds = []
     for kind in ("dirichlet", "lumped"):
-        p = problem(decomposed("triangle", 6, 4), contacts=[floor], pc_type=kind)
-        p.solve()
+        p = solved(problem(decomposed("triangle", 6, 4), contacts=[floor], pc_type=kind))
         before = p.report.F_multiplications
         bounds.append(p.estimate())
         assert p.report.estimates["algebraic"] == bounds[-1].algebraic
@@ -111,8 +108,7 @@ def of_estimates(p):
 
 def test_a_bound_that_says_nothing_is_warned_of():
     """Forces a hundred times too large stand for such that have no digits left."""
-    p = drawn(0)
-    p.solve()
+    p = solved(drawn(0))
     p.estimate()
     assert of_estimates(p) == []
     others, right = list(p.report.warnings), p.solution.lam.copy()

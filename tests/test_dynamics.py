@@ -17,6 +17,7 @@ from scenes import (
     integral,
     largest,
     measures,
+    solved,
     strain,
     vectors,
 )
@@ -230,8 +231,7 @@ def test_a_state_or_a_solution_without_velocity():
         thrown.problem.restore(state)
     d = decomposed("quadrilateral", 3)
     V, a, L = forms(d.mesh, d.facet_tags, (0.0, -0.1), d.surface("top"))
-    still = tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d)
-    still.solve()
+    still = solved(tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d))
     with pytest.raises(tfeti.InputError, match="no velocity: expected the solution of a Contact"):
         still.solution.velocity  # noqa: B018
 

@@ -36,7 +36,6 @@ def test_a_block_pushed_and_pulled_back_slips_as_in_closed_form(cell):
         assert lost == pytest.approx(BOUND * abs(step), abs=1e-8)
         scene.problem.accept()
     assert np.ptp([shear for shear, _, _ in tops(PATH)]) == pytest.approx(2 * BOUND)
-    scene.problem.destroy()
 
 
 def test_forces_over_load_steps_are_a_table(shared_tmp):
@@ -116,7 +115,6 @@ def test_going_back():
     assert np.array_equal(scene.problem.u.x.array, first.displacement.x.array)
     scene.solve()
     assert scene.problem.report.F_multiplications <= 2
-    scene.problem.destroy()
 
 
 def number_of_steps(file):

@@ -5,7 +5,6 @@ import pytest
 from bodies import (
     ORDERS,
     TO_ROUNDING,
-    boxes,
     gathered,
     held,
     jagged,
@@ -13,12 +12,11 @@ from bodies import (
     sided,
     sides_of,
     stacked,
+    torn_boxes,
     two_body_problem,
 )
 from dolfinx import fem
-from scenes import clamp, largest
-
-import tfeti_dolfinx as tfeti
+from scenes import clamp, largest, solved
 
 PRESSURE = 0.1
 
@@ -100,10 +98,9 @@ def test_uniform_pressure_between_bodies_that_are_held_all_around(cell, degree):
         return [clamp(V, d.facets(name), exact) for name in names]
 
     for order in ORDERS:
-        problem = two_body_problem(
-            d, pressed(d, PRESSURE), bcs, [sided(*order)], degree, **TO_ROUNDING
+        problem = solved(
+            two_body_problem(d, pressed(d, PRESSURE), bcs, [sided(*order)], degree, **TO_ROUNDING)
         )
-        problem.solve()
         assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
         assert np.isclose(np.abs(problem.solution.contact().resultant.force[-1]), PRESSURE)
         assert error_of_displacement(problem) < 1e-9
@@ -164,8 +161,7 @@ def test_overhanging_secondary_side(cell, subdomains, share):
         ("lower", (0.0,) * (gdim - 1) + (-1.0,), (1.0, *flat, 0.0), (3,) * gdim),
         ("upper", (0.0,) * gdim, (n * h, *flat, 1.0), (n,) * gdim),
     ]
-    mesh, tags, names = boxes(cell, parts)
-    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+    d = torn_boxes(cell, parts, subdomains)
     q = uncovered(d, PRESSURE)
 
     def load(v, ds):
@@ -173,8 +169,7 @@ def test_overhanging_secondary_side(cell, subdomains, share):
         return ends + q * v[gdim - 1] * ds(d.surface("upper bottom"))
 
     pair = sided("upper bottom", "lower top")
-    problem = two_body_problem(d, load, held(d, *sides_of(cell)), [pair], **TO_ROUNDING)
-    problem.solve()
+    problem = solved(two_body_problem(d, load, held(d, *sides_of(cell)), [pair], **TO_ROUNDING))
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
 
 
@@ -199,9 +194,8 @@ def test_hardly_covered_facets_cost_nothing():
     for share in (0.5, 1e-3, 1e-8):
         d = stacked("quadrilateral", 3, 4, 4, upper=(0.0, 4 / (3 + share)))
         sides = [*sides_of("quadrilateral"), "upper right"]
-        problem = two_body_problem(
-            d, pressed(d), held(d, *sides), [sided("upper bottom", "lower top")]
+        problem = solved(
+            two_body_problem(d, pressed(d), held(d, *sides), [sided("upper bottom", "lower top")])
         )
-        problem.solve()
         taken.append(problem.report.F_multiplications)
     assert max(taken) <= 1.5 * taken[0]

@@ -6,7 +6,7 @@ import dataclasses
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, drawn, held
+from bodies import drawn, held, torn_boxes
 from dolfinx import fem
 from panels import SPACE, polygon
 from scenes import accepted, apart, clamp, decomposed, hooke, largest, strain, vectors
@@ -463,8 +463,7 @@ def test_a_free_body_that_friction_has_held_is_let_go():
     ways, floor = [(0.0, -0.1), (0.02, -0.1), (0.02, 0.1), (0.0, -0.1)], tfeti.Plane((0, 0), (0, 1))
     for cell, mu, shape in (("triangle", 0.5, top(2)), ("quadrilateral", 0.2, ball(2, offset=0.2))):
         parts = [("a", (0.0, 0.0), (1.0, 1.0), (6, 6)), ("b", (2.0, 0.0), (3.0, 1.0), (3, 3))]
-        mesh, tags, names = boxes(cell, parts)
-        d = tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=names)
+        d = torn_boxes(cell, parts, 5)
         V, _, v = vectors(d)
         u, law, states, let_go = fem.Function(V), {"friction": tfeti.Coulomb(mu)}, {}, []
         lid = tfeti.RigidBody(shape, displacement=lambda t: ways[int(t)], name="lid")

@@ -6,7 +6,7 @@ import ufl
 from bodies import two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from scenes import CELLS, decomposed, displacement
+from scenes import CELLS, decomposed, displacement, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -64,8 +64,7 @@ def test_a_marker_finds_the_boundary_alone(cell, degree):
         assert np.all(np.isin(facets, d.boundary))
         everything = dmesh.locate_entities_boundary(d.mesh, d.mesh.topology.dim - 1, broad)
         assert np.array_equal(facets, np.intersect1d(everything, d.boundary))
-        p = problem(d, degree, lambda V, f=facets: [condition(V, f)], rtol=1e-10)
-        p.solve()
+        p = solved(problem(d, degree, lambda V, f=facets: [condition(V, f)], rtol=1e-10))
         found.append(displacement(p)[1])
     assert np.abs(found[0]).max() > 1e-3
     assert np.allclose(*found, rtol=0.0, atol=1e-8 * np.abs(found[0]).max())
