@@ -84,6 +84,11 @@ def hooke(E=1.0, nu=0.3):
     return stress
 
 
+def elastic(u, v, E=1.0, nu=0.3):
+    """The bilinear form of elasticity."""
+    return ufl.inner(hooke(E, nu)(u), strain(v)) * ufl.dx
+
+
 def forms(mesh, facet_tags, traction, top, degree=1, stress=None):
     """V, a, L of elasticity with a traction on the surface of a tag."""
     V = fem.functionspace(mesh, ("Lagrange", degree, (mesh.geometry.dim,)))

@@ -4,7 +4,7 @@ import numpy as np
 import ufl
 from bodies import clamped, drawn, two_body_problem
 from dolfinx import fem
-from scenes import curved_obstacle, decomposed, hooke, roller, strain, vectors
+from scenes import curved_obstacle, decomposed, elastic, roller, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -46,7 +46,7 @@ class Sheared:
             bcs.append(roller(V, k, d.facets("top"), self.top if k == 0 else 0.0))
         plane = tfeti.Plane(np.zeros(gdim), np.eye(gdim)[last])
         self.problem = tfeti.ContactProblem(
-            ufl.inner(hooke(nu=0.0)(u), strain(v)) * ufl.dx(domain=d.mesh),
+            elastic(u, v, nu=0.0),
             ufl.ZeroBaseForm((v,)),
             bcs,
             [tfeti.Obstacle("bottom", plane, friction=tfeti.Tresca(BOUND))],

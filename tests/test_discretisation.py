@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import clamped, drawn, held, pressed, sided, stacked, stiffer_above, two_body_problem
+from bodies import (
+    clamped,
+    drawn,
+    held,
+    pressed,
+    sided,
+    sides_of,
+    stacked,
+    stiffer_above,
+    two_body_problem,
+)
 from scenes import box, clamp, curved_obstacle, decomposed, forms, hooke, problem, solved
 from true_errors import AGAINST_FINER, ball, error_against, lame_error, shrink_fit, stress_of_cells
 
@@ -63,15 +73,9 @@ def test_stress_and_strain_may_jump_where_materials_meet(names):
 def test_bodies_in_contact_have_stresses_of_their_own():
     """Blocks of different stiffness under a pressure: each has its strain, uniform."""
     d = stacked("hexahedron", 3, 4)
-    p = two_body_problem(
-        d,
-        pressed(d, 1e-2),
-        held(d, "lower bottom", "lower left", "lower front", "upper left", "upper front"),
-        [sided("lower top", "upper bottom")],
-        stress=stiffer_above(d, 100.0),
-        rtol=1e-9,
-    )
-    p.solve()
+    bcs, pair = held(d, *sides_of("hexahedron")), [sided("lower top", "upper bottom")]
+    given = {"stress": stiffer_above(d, 100.0), "rtol": 1e-9}
+    p = solved(two_body_problem(d, pressed(d, 1e-2), bcs, pair, **given))
     assert p.estimate().relative_discretisation <= 1e-6
 
 

@@ -5,7 +5,7 @@ import pytest
 import ufl
 from bodies import stacked
 from dolfinx import fem
-from scenes import accepted, decomposed, hooke, largest, roller, strain, vectors
+from scenes import accepted, decomposed, elastic, largest, roller, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -19,7 +19,7 @@ class Driven:
         V, u, v = vectors(d)
         self.place, up = fem.Constant(d.mesh, 0.0), d.mesh.geometry.dim - 1
         self.problem = tfeti.ContactDynamics(
-            ufl.inner(hooke()(u), strain(v)) * ufl.dx(domain=d.mesh),
+            elastic(u, v),
             ufl.ZeroBaseForm((v,)),
             [roller(V, up, d.facets(side), self.place) for side in sides],
             [contact],

@@ -131,10 +131,8 @@ def test_pairs_out_of_reach_join_when_they_overlap():
 
 def test_a_body_that_only_far_surfaces_hold_is_found():
     d = stacked("quadrilateral", 3, 4, 4, gap=0.2)
-    problem = two_body_problem(
-        d, pressed(d), held(d, "lower bottom", "lower left", "upper left"), [PAIR], rtol=1e-10
-    )
-    problem.solve()
+    bcs = held(d, "lower bottom", "lower left", "upper left")
+    problem = solved(two_body_problem(d, pressed(d), bcs, [PAIR], rtol=1e-10))
     assert problem.report.late_contact_rows == problem.report.contact_rows == 5
     assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, atol=1e-6)
 

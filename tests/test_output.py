@@ -170,9 +170,9 @@ def test_a_coordinate_that_one_rank_cannot_compute(solution, comm, shared_tmp):
 
 def test_pictures(solution, comm, shared_tmp):
     name = f"{solution.dofs.bs}.png"
+    looks = {} if solution.dofs.bs == 2 else {"show": "status", "unit": "MPa"}
     files = [
-        plot_deformed(shared_tmp / f"deformed{name}", solution),
-        plot_deformed(shared_tmp / f"status{name}", solution, show="status", unit="MPa"),
+        plot_deformed(shared_tmp / f"deformed{name}", solution, **looks),
         plot_pressure(shared_tmp / f"pressure{name}", solution, lambda x: x[0], lambda x: 0 * x),
     ]
     comm.barrier()

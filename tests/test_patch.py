@@ -72,10 +72,8 @@ def test_uniform_pressure_and_linear_displacement(cell, degree, subdomains, orde
     d = stacked(cell, 3, 4, subdomains)
     if moved:
         wavy(d)
-    problem = two_body_problem(
-        d, pressed(d, PRESSURE), held(d, *sides_of(cell)), [sided(*order)], degree, **TO_ROUNDING
-    )
-    problem.solve()
+    given = pressed(d, PRESSURE), held(d, *sides_of(cell)), [sided(*order)], degree
+    problem = solved(two_body_problem(d, *given, **TO_ROUNDING))
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
     assert error_of_displacement(problem) < 1e-9
     if degree < 3:
@@ -178,10 +176,8 @@ def test_force_and_moment_balance(cell, order):
     """Both sides overhang, nothing is uniform: still action equals reaction."""
     d = stacked(cell, 3, 4, jagged, upper=(0.3, 1.4))
     sides = ["lower bottom", "lower left", "upper left", "upper top"]
-    problem = two_body_problem(
-        d, pressed(d, 0.1, "upper right"), held(d, *sides), [sided(*order)], rtol=1e-10
-    )
-    problem.solve()
+    given = pressed(d, 0.1, "upper right"), held(d, *sides), [sided(*order)]
+    problem = solved(two_body_problem(d, *given, rtol=1e-10))
     forces = problem.solution.body_forces
     assert np.abs(forces.force).max() > 1e-3
     assert np.allclose(forces.force.sum(axis=0), 0.0, rtol=0, atol=1e-12)

@@ -28,8 +28,7 @@ def cantilever(loaded, length, gap, subdomains=8):
     plane = tfeti.Plane((0.0, -tip * (gap or 0.0)), (0.0, 1.0))
     contacts = [] if gap is None else [tfeti.Obstacle("beam bottom", plane, reach=np.inf)]
     pressure = pressed(d, LOAD / (length if loaded == "top" else 1.0), f"beam {loaded}")
-    bcs = clamped(d, "beam left")
-    p = solved(two_body_problem(d, pressure, bcs, contacts, 2, hooke(E, NU)))
+    p = solved(two_body_problem(d, pressure, clamped(d, "beam left"), contacts, 2, hooke(E, NU)))
     x, u = displacement(p)
     return p, -u[np.isclose(x[:, 0], length)][:, 1].max(), tip
 
