@@ -224,15 +224,15 @@ def main(argv):
         half = cubes // 2
         tables["counted"] += [row(run(n, cubes, half), half) for n in ranks[1::2]]
         compared = []
-        for q in (2,) if quick else (2, 3):
+        for q in (1,) if quick else (2, 3):
             found, made = row(run(q**3, q**3), of=np.mean), model(q)
             compared += [
                 {"": "counted", **{name: found[name] for name in made}},
                 {"": "model", **made},
             ]
         tables["compared"] = compared
-        few, many = (1, 8) if quick else (27, 216)
-        tables["growing"] = growing(run(1, few), run(8, many), 8.0)
+        few, many, most = (1, 8, 2) if quick else (27, 216, 8)
+        tables["growing"] = growing(run(1, few), run(most, many), many / few)
     edges = (2, 3) if quick else (4, 8, 16, 22)
     tables["model"] = [model(q) for q in edges] + [model(q, (q // 2) ** 3) for q in edges]
     return finish(arguments, "ranks", tables)

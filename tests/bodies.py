@@ -5,7 +5,7 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import hooke, strain, tagged, vectors
+from scenes import clamp, hooke, roller, strain, tagged, vectors
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.compat import geometry_dofmap
@@ -23,21 +23,28 @@ def boxes(cell, parts, comm=MPI.COMM_WORLD):
 
     ``parts``: for each box its name, lowest corner, highest corner, cells along the axes.
     """
-    cell_type = dmesh.to_type(cell)
-    gdim = len(parts[0][1])
-    cells, points, start = [], [], 0
+    cell_type, gdim = dmesh.to_type(cell), len(parts[0][1])
     make = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
-    for _, low, high, n in parts:
-        box = make(MPI.COMM_SELF, [low, high], list(n), cell_type)
-        cells.append(start + geometry_dofmap(box))
-        points.append(box.geometry.x[:, :gdim])
-        start += len(box.geometry.x)
-        element = box.ufl_domain().ufl_coordinate_element()
-    cells, points = np.concatenate(cells).astype(np.int64), np.concatenate(points)
-    if comm.rank:
-        cells, points = cells[:0], points[:0]
-    mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element)
+    alone = [make(MPI.COMM_SELF, [low, high], list(n), cell_type) for _, low, high, n in parts]
+    bodies = [(box.geometry.x[:, :gdim], geometry_dofmap(box)) for box in alone]
+    mesh = joined(bodies, alone[0].ufl_domain().ufl_coordinate_element(), comm)
     return mesh, *tagged(mesh, parts)
+
+
+def joined(bodies, element, comm=MPI.COMM_WORLD):
+    """One mesh of bodies that share no node, of points and cells each, from rank 0."""
+    points, cells = zip(*bodies, strict=True)
+    starts = np.cumsum([0, *map(len, points)])
+    cells = np.concatenate([start + c for start, c in zip(starts, cells, strict=False)])
+    own = slice(0 if comm.rank else None)
+    x = np.concatenate(points)[own]
+    return dmesh.create_mesh(comm, cells=cells.astype(np.int64)[own], x=x, e=element)
+
+
+def torn_boxes(cell, parts, subdomains, **given):
+    """The same boxes, torn."""
+    mesh, tags, names = boxes(cell, parts)
+    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names, **given)
 
 
 def sides_of(cell):
@@ -55,8 +62,7 @@ def stacked(cell, n_lower=3, n_upper=4, subdomains=4, upper=(0.0, 1.0), gap=0.0)
         ("lower", (0.0,) * (gdim - 1) + (-1.0,), (1.0,) * (gdim - 1) + (0.0,), (n_lower,) * gdim),
         ("upper", (a,) * (gdim - 1) + (gap,), (b,) * (gdim - 1) + (1.0 + gap,), (n_upper,) * gdim),
     ]
-    mesh, tags, names = boxes(cell, parts)
-    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+    return torn_boxes(cell, parts, subdomains)
 
 
 def jagged(x):
@@ -65,16 +71,15 @@ def jagged(x):
     return (x[0] > zigzag) + 2 * (x[2 if np.ptp(x[2]) else 1] > 0)
 
 
-def two_body_problem(d, load, bcs, contacts, degree=1, stress=None, **options):
+def two_body_problem(d, load, bcs, contacts, degree=1, stress=None, elements=None, **options):
     """Elasticity with a load given as a linear form of the test function."""
     V, u, v = vectors(d, degree)
     stress = stress or hooke()
     exact = {"domain": d.mesh, "metadata": {"quadrature_degree": 2 * degree}}
     ds = ufl.Measure("ds", subdomain_data=d.facet_tags, **exact)
     a = ufl.inner(stress(u), strain(v)) * ufl.Measure("dx", **exact)
-    return tfeti.ContactProblem(
-        a, load(v, ds), bcs(V), contacts, d, stress=stress, petsc_options=options
-    )
+    more = {"stress": stress, "petsc_options": options, "boundary_elements": elements}
+    return tfeti.ContactProblem(a, load(v, ds), bcs(V), contacts, d, **more)
 
 
 def stiffer_above(d, ratio, nu=0.3):
@@ -89,11 +94,11 @@ def pressed(d, pressure=0.1, on="upper top"):
     return drawn(d, on, -pressure * np.eye(d.mesh.geometry.dim)[-1])
 
 
-def drawn(d, on, traction):
-    """Load: a traction on a surface, numbers or a constant."""
-    if not isinstance(traction, fem.Constant):
-        traction = fem.Constant(d.mesh, np.array(traction, dtype=float))
-    return lambda v, ds: ufl.dot(traction, v) * ds(d.surface(on))
+def drawn(d, on, force):
+    """Load: a traction on a surface, or a force per volume on None; numbers or a constant."""
+    if not isinstance(force, fem.Constant):
+        force = fem.Constant(d.mesh, np.array(force, dtype=float))
+    return lambda v, ds: ufl.dot(force, v) * (ufl.dx if on is None else ds(d.surface(on)))
 
 
 def sided(secondary, primary, **changes):
@@ -131,12 +136,20 @@ def held(d, *sides):
         made = []
         for given in sides:
             side, value = given if isinstance(given, tuple) else (given, 0.0)
-            axis = axis_of.get(side.split()[-1], 0)
-            dofs = fem.locate_dofs_topological(V.sub(axis), gdim - 1, d.facets(side))
-            made.append(fem.dirichletbc(value, dofs, V.sub(axis)))
+            made.append(roller(V, axis_of.get(side.split()[-1], 0), d.facets(side), value))
         return made
 
     return bcs
+
+
+def clamped(d, *sides):
+    """Conditions on the sides named: no displacement, or in a pair with a side its value."""
+    pairs = [given if isinstance(given, tuple) else (given, 0.0) for given in sides]
+    return lambda V: [clamp(V, d.facets(side), value) for side, value in pairs]
+
+
+def no_load(v, ds):
+    return ufl.ZeroBaseForm((v,))
 
 
 def gathered(values):

@@ -4,7 +4,7 @@ import numpy as np
 import ufl
 from bodies import stacked
 from dolfinx import fem
-from scenes import accepted, decomposed, hooke, strain, vectors
+from scenes import accepted, decomposed, elastic, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -58,7 +58,7 @@ class Thrown:
             contacts.append(tfeti.Contact("upper bottom", "lower top", reach=1.0))
         own = {k: keywords.pop(k) for k in ("mass", "stabilised", "lumped") if k in keywords}
         self.problem = tfeti.ContactDynamics(
-            ufl.inner(hooke(nu=nu)(u), strain(v)) * ufl.dx(domain=d.mesh),
+            elastic(u, v, nu=nu),
             ufl.dot(self.weight, v) * ufl.dx(domain=d.mesh),
             [],
             contacts,

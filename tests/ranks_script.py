@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import ufl
-from bodies import gathered, held, sided, stacked, two_body_problem
+from bodies import held, sided, stacked, two_body_problem
 from mpi4py import MPI
-from scenes import curved_obstacle, decomposed, displacement, problem
+from scenes import by_point, curved_obstacle, decomposed, displacement, problem, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -47,8 +47,8 @@ def write(path, p):
     x, u = displacement(p)
     data = p.solution.contact(0)
     found = {"force": data.force, "gap": data.gap, "traction": data.tangential_traction}
-    order = np.lexsort(np.rint(1e7 * gathered(data.points)).T)
-    contact = {name: gathered(values)[order] for name, values in found.items()}
+    _, *parts = by_point(MPI.COMM_WORLD, data.points, *found.values())
+    contact = dict(zip(found, parts, strict=True))
     contact |= {"sticking": p.report.sticking, "sliding": p.report.sliding}
     if MPI.COMM_WORLD.rank == 0:
         np.savez(
@@ -65,7 +65,6 @@ if __name__ == "__main__":
     folder, rtol, *cases = sys.argv[1:]
     for case in cases:
         scene, cell, subdomains = case.split("-")
-        p = SCENES[scene](cell, int(subdomains), tfeti_rtol=float(rtol))
-        p.solve()
+        p = solved(SCENES[scene](cell, int(subdomains), tfeti_rtol=float(rtol)))
         write(Path(folder) / f"{case}.npz", p)
         p.destroy()

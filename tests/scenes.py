@@ -17,17 +17,20 @@ SIDES = {2: SIDES_2D, 3: SIDES_3D}
 STAGES = ["mesh", "contact", "constraints", "assembly", "factors", "coarse", "solve", "recovery"]
 
 
-def tagged(mesh, parts):
-    """Facet tags of boxes and their names: "<box> left", "right", "bottom", "top", "front", ..."""
+def exterior(mesh):
+    """Facets with a cell on one side alone, their midpoints, and those of the cells."""
     gdim = mesh.geometry.dim
     mesh.topology.create_connectivity(gdim - 1, gdim)
     facets = dmesh.exterior_facet_indices(mesh.topology)
     links = mesh.topology.connectivity(gdim - 1, gdim)
     cells = np.array([links.links(f)[0] for f in facets], dtype=np.int32)
-    at, beside = (
-        dmesh.compute_midpoints(mesh, dim, entities)[:, :gdim]
-        for dim, entities in ((gdim - 1, facets), (gdim, cells))
-    )
+    pairs = ((gdim - 1, facets), (gdim, cells))
+    return facets, *(dmesh.compute_midpoints(mesh, *pair)[:, :gdim] for pair in pairs)
+
+
+def tagged(mesh, parts):
+    """Facet tags of boxes and their names: "<box> left", "right", "bottom", "top", "front", ..."""
+    gdim, (facets, at, beside) = mesh.geometry.dim, exterior(mesh)
     values, names = np.zeros(len(facets), dtype=np.int32), {}
     for name, low, high, *_ in parts:
         own = np.all((beside > np.array(low)) & (beside < np.array(high)), axis=1)
@@ -81,6 +84,11 @@ def hooke(E=1.0, nu=0.3):
     return stress
 
 
+def elastic(u, v, E=1.0, nu=0.3):
+    """The bilinear form of elasticity."""
+    return ufl.inner(hooke(E, nu)(u), strain(v)) * ufl.dx
+
+
 def forms(mesh, facet_tags, traction, top, degree=1, stress=None):
     """V, a, L of elasticity with a traction on the surface of a tag."""
     V = fem.functionspace(mesh, ("Lagrange", degree, (mesh.geometry.dim,)))
@@ -98,6 +106,12 @@ def clamp(V, facets, value=0.0):
     if isinstance(value, fem.Function):
         return fem.dirichletbc(value, dofs)
     return fem.dirichletbc(np.full(gdim, value) if np.isscalar(value) else value, dofs, V)
+
+
+def roller(V, axis, facets, value=0.0):
+    """A condition on one component."""
+    dofs = fem.locate_dofs_topological(V.sub(axis), V.mesh.geometry.dim - 1, facets)
+    return fem.dirichletbc(value, dofs, V.sub(axis))
 
 
 def problem(
@@ -147,14 +161,18 @@ def bumpy(height, below):
     )
 
 
+def by_point(comm, points, *values):
+    """Points and values of all ranks, sorted by point."""
+    points, *values = (np.concatenate(comm.allgather(part)) for part in (points, *values))
+    order = np.lexsort(np.rint(points.T * 1e7))
+    return points[order], *(part[order] for part in values)
+
+
 def gathered(dofs, node_values):
     """Points and values, one row per local primal node, of all groups of all ranks, by point."""
     total = dofs.reduce(node_values, np.add)
     mean = total / dofs.multiplicity.reshape(-1, *[1] * (total.ndim - 1))
-    points = np.concatenate(dofs.comm.allgather(group_points(dofs)))
-    values = np.concatenate(dofs.comm.allgather(mean))
-    order = np.lexsort(np.rint(points.T * 1e7))
-    return points[order], values[order]
+    return by_point(dofs.comm, group_points(dofs), mean)
 
 
 def displacement(problem):
@@ -203,8 +221,13 @@ def unknowns(d, degree=1):
     return V, fem.Function(V), v, u
 
 
+def solved(problem):
+    """Solve; the problem."""
+    problem.solve()
+    return problem
+
+
 def accepted(problem):
     """Solve and accept; the report."""
-    problem.solve()
-    problem.accept()
+    solved(problem).accept()
     return problem.report

@@ -2,9 +2,9 @@
 
 import numpy as np
 import ufl
-from bodies import drawn, two_body_problem
+from bodies import clamped, drawn, two_body_problem
 from dolfinx import fem
-from scenes import clamp, curved_obstacle, decomposed, hooke, strain, vectors
+from scenes import curved_obstacle, decomposed, elastic, roller, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -43,12 +43,10 @@ class Sheared:
             )
         ]
         for k in range(last):
-            dofs = fem.locate_dofs_topological(V.sub(k), fdim, d.facets("top"))
-            value = self.top if k == 0 else fem.Constant(d.mesh, 0.0)
-            bcs.append(fem.dirichletbc(value, dofs, V.sub(k)))
+            bcs.append(roller(V, k, d.facets("top"), self.top if k == 0 else 0.0))
         plane = tfeti.Plane(np.zeros(gdim), np.eye(gdim)[last])
         self.problem = tfeti.ContactProblem(
-            ufl.inner(hooke(nu=0.0)(u), strain(v)) * ufl.dx(domain=d.mesh),
+            elastic(u, v, nu=0.0),
             ufl.ZeroBaseForm((v,)),
             bcs,
             [tfeti.Obstacle("bottom", plane, friction=tfeti.Tresca(BOUND))],
@@ -74,8 +72,8 @@ class Driven:
             contact = tfeti.Obstacle("bottom", plane, friction=friction)
         else:  # rows come later
             contact = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.022)
-        bcs = lambda V: [clamp(V, d.facets("left"))]  # noqa: E731
-        self.problem = two_body_problem(d, drawn(d, "top", self.load), bcs, [contact], **options)
+        given = drawn(d, "top", self.load), clamped(d, "left")
+        self.problem = two_body_problem(d, *given, [contact], **options)
 
     def apply(self, problem, t):
         """To and fro, pressed more and more."""

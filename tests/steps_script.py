@@ -4,6 +4,7 @@ import itertools
 import os
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from bodies import held, stacked
 from dolfinx import fem
 from moving import Thrown
 from mpi4py import MPI
-from scenes import displacement, hooke, strain, vectors
+from scenes import displacement, elastic, vectors
 from sheared import Driven
 from test_nonlinear import plastic
 
@@ -88,7 +89,7 @@ class Apart:
         d = stacked("quadrilateral", 3, 4, 2, gap=0.5)
         V, u, v = vectors(d)
         self.load = fem.Constant(d.mesh, (0.0, 0.0))
-        a = ufl.inner(hooke()(u), strain(v)) * ufl.dx + ufl.dot(u, v) * ufl.dx
+        a = elastic(u, v) + ufl.dot(u, v) * ufl.dx
         L = ufl.dot(self.load, v) * ufl.dx
         plane = tfeti.Plane((0.0, 0.49), (0.0, 1.0))
         contact = tfeti.Obstacle("upper bottom", plane, friction=tfeti.Coulomb(0.3))
@@ -99,27 +100,31 @@ class Apart:
         self.load.value[:] = (0.02 * np.sin(t), -0.1)
 
 
-if __name__ == "__main__":
-    scene, folder, how = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
-    moving = {"thrown": False, "stabilised": True}
-    if scene in moving:
-        driven = Thrown(weight=0.02, stabilised=moving[scene])
-    elif scene == "coulomb":
-        driven = Driven(friction=tfeti.Coulomb(0.3), rtol=1e-12)
-    elif scene in (others := {"plastic": Pressed, "tool": Tool, "apart": Apart}):
-        driven = others[scene]()
-    else:
-        driven = Driven(rough=scene == "rough")
+SCENES = {
+    "smooth": partial(Driven, rough=False),
+    "rough": Driven,
+    "coulomb": partial(Driven, friction=tfeti.Coulomb(0.3), rtol=1e-12),
+    "thrown": partial(Thrown, weight=0.02, stabilised=False),
+    "stabilised": partial(Thrown, weight=0.02, stabilised=True),
+    "plastic": Pressed,
+    "tool": Tool,
+    "apart": Apart,
+}
+
+
+def solve(folder, how):
+    """Run the series of the scene that a folder is named after, and write what it finds."""
+    driven = SCENES[folder.name]()
 
     def apply(problem, t):
-        if how == "between" and t == TIMES[3]:
+        if t == TIMES[3] and how == "between":
             die()
         driven.apply(problem, t)
 
-    if how in DEATHS:
-        die_at(*DEATHS[how])
+    folder.mkdir(exist_ok=True)
+    times = TIMES[:3] if how == "begun" else TIMES
     steps = tfeti.LoadSteps(
-        driven.problem, apply, TIMES, path=folder / "series.bp", checkpoint=folder / "checkpoint"
+        driven.problem, apply, times, path=folder / "series.bp", checkpoint=folder / "checkpoint"
     )
     records = steps.run(resume=how == "resume")
     x, u = displacement(driven.problem)
@@ -133,3 +138,11 @@ if __name__ == "__main__":
         F = np.array([r.figures["F_multiplications"] for r in records])
         late = np.array([r.figures["late_contact_rows"] for r in records])
         np.savez(folder / "found.npz", x=x, u=u, figures=figures, F=F, late=late, **everywhere)
+
+
+if __name__ == "__main__":
+    how, *folders = sys.argv[1:]
+    if how in DEATHS:
+        die_at(*DEATHS[how])
+    for folder in folders:
+        solve(Path(folder), how)

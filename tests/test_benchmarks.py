@@ -42,7 +42,7 @@ RUNS = [
     with_arguments(linear_price, "--scenes", "cube_3d", "--processor"),
     with_arguments(ranks),
     with_arguments(stability, "--groups", "nu"),
-    with_arguments(scaling),
+    with_arguments(scaling, "--repeats", "1"),
     with_arguments(talk_tables, "--rtol", "1e-4"),
     with_arguments(solver_profiles, "--steps", "100", slow=True),
     with_arguments(time_against_error, "--ranks", "1", "--scenes", "half cylinder", slow=True),

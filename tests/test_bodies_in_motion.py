@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes
+from bodies import torn_boxes
 from dolfinx import fem
-from scenes import accepted, hooke, strain, vectors
+from scenes import accepted, elastic, vectors
 from scipy.optimize import lsq_linear
 
 import tfeti_dolfinx as tfeti
@@ -18,8 +18,7 @@ def falling(cell, degree, gap, stabilised, weight):
         low += gap
         parts.append((f"box {n}", (x, low), (x + 1.0, low + height), (2 + n, 2)))
         low += height
-    mesh, tags, names = boxes(cell, parts)
-    d = tfeti.decompose(mesh, 7, facet_tags=tags, surfaces=names)
+    d = torn_boxes(cell, parts, 7)
     V, u, v = vectors(d, degree)
     down = fem.Constant(d.mesh, (0.0, -weight))
     thrown = fem.Function(V)
@@ -27,7 +26,7 @@ def falling(cell, degree, gap, stabilised, weight):
     contacts = [tfeti.Obstacle("box 0 bottom", tfeti.Plane((0, 0), (0, 1)), reach=2.0)]
     contacts += [tfeti.Contact(f"box {n} bottom", f"box {n - 1} top", reach=2.0) for n in (1, 2)]
     return tfeti.ContactDynamics(
-        ufl.inner(hooke()(u), strain(v)) * ufl.dx(domain=d.mesh),
+        elastic(u, v),
         ufl.dot(down, v) * ufl.dx(domain=d.mesh),
         [],
         contacts,

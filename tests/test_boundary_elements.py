@@ -4,22 +4,11 @@ import dolfinx
 import numpy as np
 import pytest
 import ufl
-from bodies import drawn, held
+from bodies import clamped, drawn, held, no_load, pressed, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from panels import kelvin
-from scenes import (
-    SIDES,
-    box,
-    clamp,
-    curved_obstacle,
-    decomposed,
-    displacement,
-    forms,
-    hooke,
-    measures,
-    relative,
-)
+from scenes import SIDES, box, curved_obstacle, decomposed, displacement, forms, relative, solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.bem.block import Parts
@@ -50,23 +39,6 @@ def test_blocks_keep_their_promises(cell, n):
         check_block(block, part.shape.K[part.place][:, part.place])
 
 
-def problem(d, elements=ALL, contacts=(), sides=("left",), load=None, **options):
-    gdim = d.mesh.geometry.dim
-    V, a, L = forms(d.mesh, d.facet_tags, (0.0,) * (gdim - 1) + (-0.05,), d.surface("top"))
-    if load is not None:
-        L = load(V)
-    return tfeti.ContactProblem(
-        a,
-        L,
-        [clamp(V, d.facets(side)) for side in sides],
-        list(contacts),
-        d,
-        stress=hooke(),
-        petsc_options={"tfeti_rtol": 1e-9, **options},
-        boundary_elements=elements,
-    )
-
-
 @pytest.mark.parametrize(
     ("cell", "sizes", "qp_type"),
     [
@@ -75,15 +47,16 @@ def problem(d, elements=ALL, contacts=(), sides=("left",), load=None, **options)
     ],
 )
 def test_a_scene_of_both_kinds_of_elements_has_one_limit(cell, sizes, qp_type):
-    floor = tfeti.Obstacle("bottom", curved_obstacle(3 if cell == "hexahedron" else 2))
-    difference = []
+    gdim, difference = 3 if cell == "hexahedron" else 2, []
+    floor = tfeti.Obstacle("bottom", curved_obstacle(gdim))
     for n in sizes:
         found = []
         for elements in (None, ALL):
-            p = problem(decomposed(cell, n, 4), elements, [floor], tfeti_qp_type=qp_type)
-            p.solve()
+            d = decomposed(cell, n, 4)
+            given = pressed(d, 0.05, "top"), clamped(d, "left"), [floor]
+            options = {"qp_type": qp_type, "rtol": 1e-9}
+            p = solved(two_body_problem(d, *given, elements=elements, **options))
             found.append(displacement(p)[1][:, -1].min())
-            p.destroy()
         difference.append(found[0] / found[1])
     assert 0.95 < difference[0] < difference[1] < 1.0  # softer
     assert 1.0 - difference[1] < 0.75 * (1.0 - difference[0])
@@ -94,30 +67,23 @@ STRETCH = np.array([0.1, -0.1 * 0.3 / 0.7])
 
 def tension(d, elements, t=None):
     """Two volumes under uniaxial tension, solved; given t, it can be changed afterwards."""
-    V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
-    t = fem.Constant(d.mesh, (0.1 / (1 - 0.3**2), 0.0)) if t is None else t
-    L, given = drawn(d, "right", t)(ufl.TestFunction(V), measures(d)[1]), held(d, "left", "bottom")
-    more = {"stress": hooke(), "petsc_options": {"rtol": 1e-10}, "boundary_elements": elements}
-    p = tfeti.ContactProblem(a, L, given(V), [], d, **more)
-    p.solve()
-    return p
+    load = drawn(d, "right", (0.1 / (1 - 0.3**2), 0.0) if t is None else t)
+    bcs = held(d, "left", "bottom")
+    return solved(two_body_problem(d, load, bcs, [], elements=elements, rtol=1e-10))
 
 
 def test_constant_stresses_are_exact_in_space():
     """The mean of both ways to cut the facets of hexahedra loads corners as they do."""
     d = two_volumes("hexahedron", 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0, 0.1), d.surface("top"))
-    rollers = held(d, "left", "front", "bottom")(V)
+    given = drawn(d, "top", (0.0, 0.0, 0.1)), held(d, "left", "front", "bottom"), []
     for elements in (tfeti.BoundaryElements("low"), ALL):
-        p = tfeti.ContactProblem(a, L, rollers, [], d, stress=hooke(), boundary_elements=elements)
-        p.solve()
+        p = solved(two_body_problem(d, *given, elements=elements))
         x, u = displacement(p)
         assert np.abs(u - x * (-0.03, -0.03, 0.1)).max() < 1e-6
         values = p.solution.at([(0.4, 0.3, 0.2)])
         assert np.abs(values.displacement - (-0.012, -0.009, 0.02)).max() < 1e-6
         (_, stress), _ = cells_and_nodes(p.solution.interior, d)
         assert np.abs(stress - np.diag((0.0, 0.0, 0.1))).max(initial=0.0) < 1e-6
-        p.destroy()
 
 
 def two_volumes(cell="triangle", n=4):
@@ -135,17 +101,12 @@ def two_volumes(cell="triangle", n=4):
 
 def test_a_force_per_volume():
     """A square that stands on its side: boundary elements are nearer to a fine solution."""
-
-    def weight(V):
-        return ufl.dot(fem.Constant(V.mesh, (0.02, -0.1)), ufl.TestFunction(V)) * ufl.dx
-
     found = []
     for n, elements in ((4, None), (4, ALL), (16, None)):
-        p = problem(decomposed("quadrilateral", n, 4), elements, sides=("bottom",), load=weight)
-        p.solve()
-        x, u = displacement(p)
+        d = decomposed("quadrilateral", n, 4)
+        given = drawn(d, None, (0.02, -0.1)), clamped(d, "bottom"), []
+        x, u = displacement(solved(two_body_problem(d, *given, elements=elements, rtol=1e-9)))
         found.append(u[np.all(np.isclose(x * 4, np.rint(x * 4)), axis=1)])
-        p.destroy()
     assert relative(found[1], found[2]) < 0.6 * relative(found[0], found[2]) < 0.1
 
 
@@ -183,7 +144,6 @@ def test_constant_stresses_are_exact_everywhere(elements):
     assert np.abs(stress - np.diag([t, 0.0, 0.3 * t])).max(initial=0.0) < 1e-8
     mises = p.solution.interior.von_mises.x.array
     assert np.abs(mises - t * np.sqrt(1 - 0.3 + 0.3**2)).max(initial=0.0) < 1e-8
-    p.destroy()
 
 
 @pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
@@ -214,7 +174,6 @@ def test_fields_inside_in_each_step_of_a_series(shared_tmp):
     series([0.5, 1.0])
     with pytest.raises(tfeti.InputError, match="checkpoint has no field interior_displacement"):
         series([0.5, 1.0, 1.5], resume=True, interior=True)
-    p.destroy()
 
 
 @pytest.mark.parametrize(
@@ -228,13 +187,10 @@ def test_fields_inside_of_a_point_force_outside(cell, sizes):
         d = decomposed(cell, n, 2)
         gdim = d.mesh.geometry.dim
         source = np.array([1.6, 0.7, 0.6])[:gdim]
-        V, a, L = forms(d.mesh, d.facet_tags, (0.0,) * gdim, d.surface("top"))
-        given = fem.Function(V)
+        given = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,))))
         given.interpolate(lambda x, k=gdim, s=source: kelvin(x[:k].T, s, law)[0].T)
-        facets = np.concatenate([d.facets(name) for name in SIDES[gdim]])
-        bcs = [clamp(V, facets, given)]
-        p = tfeti.ContactProblem(a, L, bcs, [], d, stress=hooke(), boundary_elements=ALL)
-        p.solve()
+        bcs = clamped(d, *((name, given) for name in SIDES[gdim]))
+        p = solved(two_body_problem(d, no_load, bcs, [], elements=ALL))
         (middle, stress), (x, u) = cells_and_nodes(p.solution.interior, d)
         exact = law.stress(kelvin(middle, source, law)[1])
         off = np.all((x > 1e-9) & (x < 1 - 1e-9), axis=1)  # where nothing is prescribed
@@ -244,7 +200,6 @@ def test_fields_inside_of_a_point_force_outside(cell, sizes):
         same = p.solution.at(np.concatenate(d.comm.allgather(middle))).stress
         found = np.concatenate(d.comm.allgather(stress))[:, :gdim, :gdim]
         assert np.abs(found - same).max() < 1e-12 * np.abs(same).max()
-        p.destroy()
     slopes = np.log2(np.divide(*errors))
     assert np.all(slopes > 1.5), (errors, slopes)
     assert np.all(errors[1] < np.array((2e-3, 5e-3) if gdim == 2 else (1e-2, 6e-2))), errors
@@ -253,13 +208,13 @@ def test_fields_inside_of_a_point_force_outside(cell, sizes):
 def test_a_change_of_modulus_and_of_load():
     """A second solve makes S anew where the form has changed, and only there."""
     d = decomposed("triangle", 6, 4)
-    V, _, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
     elastic = tfeti.Elasticity(d, E=1.0, nu=0.3, model="plane_stress", thickness=0.1)
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     force = fem.Constant(d.mesh, (0.0, -0.1))
     L = elastic.thickness * ufl.dot(force, v) * ufl.dx
     given = {"stress": elastic.stress, "thickness": elastic.thickness, "boundary_elements": ALL}
-    bcs, options = [clamp(V, d.facets("left"))], {"tfeti_rtol": 1e-10}
+    bcs, options = clamped(d, "left")(V), {"tfeti_rtol": 1e-10}
     p = tfeti.ContactProblem(elastic.a(u, v), L, bcs, [], d, petsc_options=options, **given)
     first = p.solve().x.array.copy()
     elastic.E.value = 2.0

@@ -11,10 +11,10 @@ from scenes import (
     curved_obstacle,
     decomposed,
     displacement,
-    hooke,
+    elastic,
     problem,
     relative,
-    strain,
+    solved,
 )
 
 import tfeti_dolfinx as tfeti
@@ -46,8 +46,7 @@ def reference(cell="hexahedron", n=6, grading=1.0):
 @pytest.mark.parametrize("cell", CELLS)
 def test_agrees_with_an_active_set_on_the_untorn_mesh(cell):
     n = 12 if gdim_of(cell) == 2 else 6
-    p = contact_problem(cell, n)
-    p.solve()
+    p = solved(contact_problem(cell, n))
     u, lam = reference(cell, n)
     assert relative(displacement(p)[1], u) <= 1e-8
     force = p.decomposition.comm.allreduce(p.solution.contact(0).force.sum())
@@ -65,14 +64,12 @@ def test_agrees_with_an_active_set_on_the_untorn_mesh(cell):
     ],
 )
 def test_variants_find_the_same(options):
-    p = contact_problem(**options)
-    p.solve()
+    p = solved(contact_problem(**options))
     assert relative(displacement(p)[1], reference()[0]) <= 1e-8
 
 
 def test_the_laws_of_contact_hold_below_the_tolerance():
-    p = contact_problem(tfeti_rtol=1e-6)
-    p.solve()
+    p = solved(contact_problem(tfeti_rtol=1e-6))
     for name, allowed in p.report.tolerances.items():
         assert p.report.residuals[name] <= allowed, name
 
@@ -84,8 +81,7 @@ def test_forces_are_in_equilibrium_with_the_stress():
     d = p.decomposition
     V = uh.function_space
     v = ufl.TestFunction(V)
-    dx = ufl.dx(metadata={"quadrature_degree": 2})
-    internal = fem.assemble_vector(fem.form(ufl.inner(hooke()(uh), strain(v)) * dx)).array
+    internal = fem.assemble_vector(fem.form(elastic(uh, v))).array
     lifted = p.dofs.reduce(p.dofs.to_primal(internal).reshape(-1, 3), np.add)
     forces = np.zeros((p.dofs.num_groups, 3))
     records = p.solution.gluing.records
@@ -122,8 +118,7 @@ def test_a_body_held_only_by_contact():
         tfeti.Obstacle("bottom", tfeti.Plane((0, -0.01), (0, 1))),
         tfeti.Obstacle("left", tfeti.Plane((-0.01, 0), (1, 0))),
     ]
-    p = problem(d, (-0.02, -0.05), corner, clamped=(), tfeti_rtol=1e-9)
-    p.solve()
+    p = solved(problem(d, (-0.02, -0.05), corner, clamped=(), tfeti_rtol=1e-9))
     comm, s = d.comm, p.solution
     assert comm.allreduce(s.contact(0).force.sum()) == pytest.approx(0.05, rel=1e-6)
     assert comm.allreduce(s.contact(1).force.sum()) == pytest.approx(0.02, rel=1e-6)
@@ -131,8 +126,7 @@ def test_a_body_held_only_by_contact():
 
 
 def test_multiplications_are_counted_by_the_book():
-    p = contact_problem(tfeti_rtol=1e-6, tfeti_qp_type="smalse")
-    p.solve()
+    p = solved(contact_problem(tfeti_rtol=1e-6, tfeti_qp_type="smalse"))
     r = p.report
     steps = r.cg_steps + 2 * r.expansion_steps + r.proportioning_steps
     assert r.F_multiplications == steps + 1  # F λ̄; P_Ω(0) = 0 here, so no multiplication for it

@@ -4,9 +4,9 @@ from functools import partial
 
 import numpy as np
 import pytest
-from bodies import drawn, gathered, held, pressed, stacked, two_body_problem
+from bodies import clamped, gathered, held, no_load, pressed, stacked, two_body_problem
 from dolfinx import fem
-from scenes import decomposed, problem, vectors
+from scenes import decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 from meshes import half_ball, half_cylinder
@@ -71,21 +71,12 @@ def test_moments_on_curved_facets_are_in_balance(mesh, comm):
     build = partial(mesh.build, fine=0.2, fine_radius=0.3, growth=0.5)
     d = torn(comm, build, 3, order=2)
     gdim = d.mesh.geometry.dim
-    V, *_ = vectors(d, 2)
-    top = fem.locate_dofs_topological(V, gdim - 1, d.facets("top"))
     given = np.array([0.003, -0.002, -0.01] if gdim == 3 else [0.003, -0.01])
-    way = fem.Function(V)
+    way = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 2, (gdim,))))
     way.interpolate(lambda x: given[:, None] * (1.0 + x[0]))
     plane = tfeti.Plane((0.0,) * gdim, (0.0,) * (gdim - 1) + (1.0,))
-    p = two_body_problem(
-        d,
-        drawn(d, "top", np.zeros(gdim)),
-        lambda V: [fem.dirichletbc(way, top)],
-        [tfeti.Obstacle("contact", plane, friction=tfeti.Coulomb(0.3))],
-        degree=2,
-        rtol=1e-10,
-    )
-    p.solve()
+    floor = [tfeti.Obstacle("contact", plane, friction=tfeti.Coulomb(0.3))]
+    p = solved(two_body_problem(d, no_load, clamped(d, ("top", way)), floor, 2, rtol=1e-10))
     pushed, kept = p.solution.contact().resultant, p.solution.reaction("top")
     size = np.abs(pushed.moment).max()
     assert size > 1e-6
@@ -97,8 +88,7 @@ def test_a_reaction_is_the_force_of_the_stress(comm):
     """A bar that is stretched: E ε on its end, friction of the floor beside it."""
     d = decomposed("quadrilateral", 4, 4)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), friction=tfeti.Tresca(0.01))
-    p = problem(d, traction=(0.02, -0.05), contacts=[floor], rtol=1e-10)
-    p.solve()
+    p = solved(problem(d, traction=(0.02, -0.05), contacts=[floor], rtol=1e-10))
     friction = p.solution.contact().resultant
     reaction = p.solution.reaction("left")
     assert np.allclose(reaction.force + friction.force, (-0.02, 0.05), rtol=0, atol=1e-8)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from bodies import ORDERS, boxes, dofs_on, gathered, searched, sided, stacked
+from bodies import ORDERS, dofs_on, gathered, searched, sided, stacked, torn_boxes
 from mpi4py import MPI
-from scenes import CELLS, decomposed, problem
+from scenes import CELLS, decomposed, problem, solved
 from true_errors import OVERLAP, ring_problem
 
 import tfeti_dolfinx as tfeti
@@ -20,8 +20,7 @@ def shaped(cell, n_lower, n_upper, lower, upper, across=(0.0, 1.0)):
         ("lower", (0.0,) * last + (-1.0,), (1.0,) * last + (0.0,), (n_lower,) * last + (2,)),
         ("upper", (*low, 0.5), (*high, 1.5), (n_upper,) * last + (2,)),
     ]
-    mesh, tags, names = boxes(cell, parts)
-    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
+    d = torn_boxes(cell, parts, 4)
     x = d.mesh.geometry.x
     at, z = x[:, :last] - 0.5, x[:, last]
     above = z > 0.25
@@ -139,8 +138,7 @@ def test_the_gap_of_an_obstacle_is_what_is_given():
     plane = tfeti.Plane((0, -0.3), (0, 1))
     for gap, expected in ((0.01, 0.01), (-0.02, -0.02), (lambda x: 0.1 * x[0], None)):
         contacts = [tfeti.Obstacle("bottom", plane, gap=gap)]
-        p = problem(d, contacts=contacts, clamped=("top",), loaded="right")
-        p.solve()
+        p = solved(problem(d, contacts=contacts, clamped=("top",), loaded="right"))
         records, x = p.solution.gluing.records, p.solution.contact().points
         assert np.allclose(records.gap, 0.1 * x[:, 0] if expected is None else expected)
         assert p.report.contact_rows > 0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from bodies import gathered, held, pressed, sided, stacked, two_body_problem
-from scenes import decomposed, displacement, problem, relative
+from scenes import decomposed, displacement, problem, relative, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -32,8 +32,7 @@ def test_a_pair_that_never_touches_changes_nothing(distance):
     for contacts in ([], [sided(*SIDES)]):
         d = stacked("triangle", 3, 4, 4, gap=distance)
         sides = ["lower bottom", "lower left", "upper top", "upper left"]
-        p = two_body_problem(d, pressed(d, 1e-3, "upper right"), held(d, *sides), contacts)
-        p.solve()
+        p = solved(two_body_problem(d, pressed(d, 1e-3, "upper right"), held(d, *sides), contacts))
         assert p.report.contact_rows == 0
         found.append(displacement(p)[1])
     assert relative(*found) <= 1e-12
@@ -44,8 +43,7 @@ def test_who_meets_nobody_is_said(caplog):
     sides = ["lower bottom", "lower left", "upper left"]
     contacts = [sided(*SIDES), sided("upper right", "lower right")]
     contacts += [tfeti.Obstacle("lower top", tfeti.Plane((0, 30), (0, -1)))]
-    p = two_body_problem(d, pressed(d), held(d, *sides), contacts)
-    p.solve()
+    p = solved(two_body_problem(d, pressed(d), held(d, *sides), contacts))
     unmet = ["1: contact of 'upper right' with 'lower right'", "2: obstacle of surface 'lower top'"]
     assert p.report.unmet_contacts == unmet
     for name in unmet:
@@ -73,8 +71,7 @@ def test_a_punch_from_afar_presses_by_little(rtol):
     sides = ["lower bottom", "lower left", ("upper top", -0.3005), "upper left"]
     forces = []
     for one in (rtol, 1e-10):
-        p = two_body_problem(d, pressed(d, 0.0), held(d, *sides), [sided(*SIDES)], rtol=one)
-        p.solve()
+        p = solved(two_body_problem(d, pressed(d, 0.0), held(d, *sides), [sided(*SIDES)], rtol=one))
         forces.append(p.solution.contact(0).resultant.force[1])
     assert forces[1] > 1e-4
     assert forces[0] == pytest.approx(forces[1], rel=rtol)
@@ -84,8 +81,7 @@ def test_a_body_that_only_a_far_obstacle_holds():
     """What is farther yet, and not needed, gets no rows."""
     d = decomposed("quadrilateral", 6)
     beyond = tfeti.Obstacle("top", tfeti.Plane((0, 1e6), (0, -1)))
-    p = problem(d, (0.0, -0.01), [below(5.0), beyond], clamped=(), rtol=1e-9)
-    p.solve()
+    p = solved(problem(d, (0.0, -0.01), [below(5.0), beyond], clamped=(), rtol=1e-9))
     assert p.report.contact_rows == p.report.late_contact_rows == 7
     assert p.report.unmet_contacts == ["1: obstacle of surface 'top'"]
     assert np.isclose(gathered(p.solution.contact(0).force).sum(), 0.01)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, two_body_problem
+from bodies import clamped, drawn, torn_boxes, two_body_problem
 from dolfinx import fem, mesh
 from mpi4py import MPI
 from scenes import apart, bumpy, clamp, decomposed, displacement, forms, problem, vectors
@@ -121,8 +121,7 @@ def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(
 def test_the_body_that_slides_without_end_is_named():
     """Of a square pressed on a plane and one between walls that nothing presses."""
     parts = [("still", (0.0, 0.0), (1.0, 1.0), (3, 3)), ("loose", (2.0, 0.0), (3.0, 1.0), (3, 3))]
-    mesh, tags, names = boxes("quadrilateral", parts)
-    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
+    d = torn_boxes("quadrilateral", parts, 4)
     planes = {"still bottom": ((0, 0), (0, 1)), "loose left": ((2, 0), (1, 0))}
     planes["loose right"], law = ((3, 0), (-1, 0)), tfeti.Coulomb(0.5)
     contacts = [
@@ -130,7 +129,7 @@ def test_the_body_that_slides_without_end_is_named():
         for side, plane in planes.items()
     ]
     tops = d.surface("still top"), d.surface("loose top")
-    p = two_body_problem(d, lambda v, ds: -0.05 * v[1] * ds(tops), lambda V: [], contacts)
+    p = two_body_problem(d, lambda v, ds: -0.05 * v[1] * ds(tops), clamped(d), contacts)
     said = r"body \d is free to move \(translation in y\) without end on contact 1: .* 2: .* gap"
     with pytest.raises(tfeti.ConvergenceError, match=f"DIVERGED_FRICTION .* {said}"):
         p.solve()
@@ -143,7 +142,7 @@ def test_a_ring_is_turned_in_its_fit_as_far_as_friction_holds(comm):
     p = two_body_problem(
         d,
         lambda v, ds: twist * (x * v[1] - y * v[0]) * ds(d.surface("in0")),
-        lambda V: [clamp(V, d.facets("out1"))],
+        clamped(d, "out1"),
         [tfeti.Contact("out0", "in1", gap=-0.01, friction=tfeti.Coulomb(0.2), name="fit")],
     )
     p.solve()
@@ -177,11 +176,10 @@ def test_what_sticks_where_a_wall_pushes_slips():
 @pytest.mark.parametrize(("weight", "side"), [(1e-4, 0.026), (1e-6, 0.2), (1e-7, 0.026)])
 def test_a_block_that_falls_onto_waves_is_held(weight, side):
     """If all points stuck it would hang above them, and press nowhere."""
-    mesh, tags, names = boxes("quadrilateral", [("a", (0.0, 0.0), (1.0, 0.7), (6, 3))])
-    d = tfeti.decompose(mesh, 2, facet_tags=tags, surfaces=names)
+    d = torn_boxes("quadrilateral", [("a", (0.0, 0.0), (1.0, 0.7), (6, 3))], 2)
     contacts = [tfeti.Obstacle("a bottom", bumpy(0.004, 0.006), friction=tfeti.Coulomb(0.5))]
     force = fem.Constant(d.mesh, (weight * side, -weight))
-    p = two_body_problem(d, lambda v, ds: ufl.dot(force, v) * ufl.dx, lambda V: [], contacts)
+    p = two_body_problem(d, drawn(d, None, force), clamped(d), contacts)
     p.solve()
     found = p.solution.contact().resultant.force[:2]
     assert np.allclose(found, -0.7 * np.asarray(force.value), rtol=1e-6, atol=0.0)

@@ -3,8 +3,18 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import drawn, held, pressed, sided, stacked, stiffer_above, two_body_problem
-from scenes import box, clamp, curved_obstacle, decomposed, forms, hooke, problem
+from bodies import (
+    clamped,
+    drawn,
+    held,
+    pressed,
+    sided,
+    sides_of,
+    stacked,
+    stiffer_above,
+    two_body_problem,
+)
+from scenes import box, clamp, curved_obstacle, decomposed, forms, hooke, problem, solved
 from true_errors import AGAINST_FINER, ball, error_against, lame_error, shrink_fit, stress_of_cells
 
 import tfeti_dolfinx as tfeti
@@ -21,8 +31,7 @@ def index(p, true):
 @pytest.mark.parametrize(("degree", "triangles"), [(1, True), (2, False)])
 @pytest.mark.parametrize("cells", [8, pytest.param(32, marks=pytest.mark.slow)])
 def test_shrink_fit(cells, degree, triangles):
-    p = shrink_fit(cells, degree, triangles, **RTOL)
-    p.solve()
+    p = solved(shrink_fit(cells, degree, triangles, **RTOL))
     error, size = lame_error(p)
     assert p.estimate().energy == pytest.approx(size, rel=0.05)
     assert 0.4 <= index(p, error) <= 1.5
@@ -33,12 +42,10 @@ def test_shrink_fit(cells, degree, triangles):
     [*AGAINST_FINER, pytest.param(ball, (3_000, 10_000, 30_000), 240_000, marks=pytest.mark.slow)],
 )
 def test_against_a_finer_mesh(serial_only, scene, sizes, finest):
-    finer = scene(finest, **RTOL)
-    finer.solve()
+    finer = solved(scene(finest, **RTOL))
     reference, errors = stress_of_cells(finer), []
     for size in sizes:
-        p = scene(size, **RTOL)
-        p.solve()
+        p = solved(scene(size, **RTOL))
         error, energy = error_against(p, reference)
         errors.append(error / energy)
         assert 0.6 <= index(p, error) <= 1.5
@@ -57,26 +64,18 @@ def test_stress_and_strain_may_jump_where_materials_meet(names):
     """ν = 0, pulled: the strain jumps, and the solution is exact."""
     d = layers(names)
     stress = hooke(ufl.conditional(ufl.gt(ufl.SpatialCoordinate(d.mesh)[2], 0.5), 10.0, 1.0), 0.0)
-    bcs = lambda V: [clamp(V, d.facets("bottom"))]  # noqa: E731
-    p = two_body_problem(d, drawn(d, "top", (0, 0, 1e-3)), bcs, [], stress=stress, rtol=1e-9)
-    p.solve()
+    given = drawn(d, "top", (0, 0, 1e-3)), clamped(d, "bottom"), []
+    p = solved(two_body_problem(d, *given, stress=stress, rtol=1e-9))
     found = p.estimate().relative_discretisation
     assert (found <= 1e-6) == names
-    p.destroy()
 
 
 def test_bodies_in_contact_have_stresses_of_their_own():
     """Blocks of different stiffness under a pressure: each has its strain, uniform."""
     d = stacked("hexahedron", 3, 4)
-    p = two_body_problem(
-        d,
-        pressed(d, 1e-2),
-        held(d, "lower bottom", "lower left", "lower front", "upper left", "upper front"),
-        [sided("lower top", "upper bottom")],
-        stress=stiffer_above(d, 100.0),
-        rtol=1e-9,
-    )
-    p.solve()
+    bcs, pair = held(d, *sides_of("hexahedron")), [sided("lower top", "upper bottom")]
+    given = {"stress": stiffer_above(d, 100.0), "rtol": 1e-9}
+    p = solved(two_body_problem(d, pressed(d, 1e-2), bcs, pair, **given))
     assert p.estimate().relative_discretisation <= 1e-6
 
 
@@ -87,8 +86,7 @@ def test_it_does_not_see_tears(cell):
     for subdomains in (1, 7):
         d = decomposed(cell, 5, subdomains)
         obstacle = tfeti.Obstacle("bottom", curved_obstacle(d.mesh.geometry.dim))
-        p = problem(d, contacts=[obstacle], rtol=1e-9)
-        p.solve()
+        p = solved(problem(d, contacts=[obstacle], rtol=1e-9))
         found.append(p.estimate().discretisation)
         field = p.solution.discretisation_error.x.array
         assert np.all(field >= 0.0)
@@ -100,8 +98,7 @@ def test_it_does_not_see_tears(cell):
 def test_without_a_stress_only_the_algebraic_error_is_known():
     d = decomposed("triangle", 3, 2)
     V, a, L = forms(d.mesh, d.facet_tags, (0.0, -1e-2), d.surface("top"))
-    p = tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d)
-    p.solve()
+    p = solved(tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d))
     found = p.estimate()
     assert found.discretisation is None
     assert np.isnan(found.relative_discretisation)
@@ -109,8 +106,7 @@ def test_without_a_stress_only_the_algebraic_error_is_known():
 
 
 def test_files_have_the_field_once_it_is_made():
-    p = problem(decomposed("quadrilateral", 6, 5))
-    p.solve()
+    p = solved(problem(decomposed("quadrilateral", 6, 5)))
     names = [field.name for field in cell_fields(p.solution)]
     p.estimate()
     fields = cell_fields(p.solution)

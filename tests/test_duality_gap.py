@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import ufl
-from bodies import held, sided, stacked, stiffer_above, two_body_problem
-from dolfinx import fem
-from scenes import CELLS, curved_obstacle, decomposed, problem
+from bodies import drawn, held, sided, stacked, stiffer_above, two_body_problem
+from scenes import CELLS, curved_obstacle, decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.solve.solver import solve_dual
@@ -23,7 +21,7 @@ SOLVERS = (
 )
 
 
-def drawn(seed):
+def made(seed):
     """A block on a block that does not match it: a problem of a seed, and rtol."""
     rng = np.random.default_rng([seed, 11])
     cell = CELLS[seed % 4]
@@ -40,17 +38,10 @@ def drawn(seed):
     if not flat or law is None:
         force[:-1] = 0.0
     rtol = 10.0 ** rng.uniform(-7, -2)
-    p = two_body_problem(
-        d,
-        lambda v, ds: ufl.dot(fem.Constant(d.mesh, force), v) * ds(d.surface("upper top")),
-        bcs,
-        [pair],
-        stress=stiffer_above(d, 10.0 ** rng.uniform(-2, 3), rng.uniform(0.0, 0.45)),
-        rtol=rtol,
-        **SOLVERS[int(rng.random() < 0.3)][int(rng.random() < 0.3)],
-        error_if_not_converged=False,
-    )
-    return p
+    stress = stiffer_above(d, 10.0 ** rng.uniform(-2, 3), rng.uniform(0.0, 0.45))
+    options = SOLVERS[int(rng.random() < 0.3)][int(rng.random() < 0.3)]
+    options = {**options, "rtol": rtol, "error_if_not_converged": False}
+    return two_body_problem(d, drawn(d, "upper top", force), bcs, [pair], stress=stress, **options)
 
 
 def norm(p, u):
@@ -71,8 +62,7 @@ def exact(p):
     "seed", [pytest.param(s, marks=[] if s < 12 else [pytest.mark.slow]) for s in range(50)]
 )
 def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
-    p = drawn(seed)
-    p.solve()
+    p = solved(made(seed))
     reported = p.report.residuals["energy_error"]
     assert reported <= p.report.tolerances["energy_error"]
     found, error = p.estimate(), norm(p, p.solution.u - exact(p))
@@ -84,7 +74,6 @@ def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
     if p.options.qp_type == "newton":
         # of Newton's iterates on friction: ψ|q| − τᵀq of a long slip q is far above ½‖u − u*‖²_K
         assert reported * size <= 2 * found.algebraic + 1e-11 * size
-    p.destroy()
 
 
 def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says():
@@ -92,8 +81,7 @@ def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says():
     floor = tfeti.Obstacle("bottom", curved_obstacle(2), reach=0.2)
     bounds = []
     for kind in ("dirichlet", "lumped"):
-        p = problem(decomposed("triangle", 6, 4), contacts=[floor], pc_type=kind)
-        p.solve()
+        p = solved(problem(decomposed("triangle", 6, 4), contacts=[floor], pc_type=kind))
         before = p.report.F_multiplications
         bounds.append(p.estimate())
         assert p.report.estimates["algebraic"] == bounds[-1].algebraic
@@ -111,8 +99,7 @@ def of_estimates(p):
 
 def test_a_bound_that_says_nothing_is_warned_of():
     """Forces a hundred times too large stand for such that have no digits left."""
-    p = drawn(0)
-    p.solve()
+    p = solved(made(0))
     p.estimate()
     assert of_estimates(p) == []
     others, right = list(p.report.warnings), p.solution.lam.copy()

@@ -12,12 +12,13 @@ from scenes import (
     accepted,
     clamp,
     decomposed,
+    elastic,
     forms,
     hooke,
     integral,
     largest,
     measures,
-    strain,
+    solved,
     vectors,
 )
 from scenes import displacement as nodal
@@ -230,8 +231,7 @@ def test_a_state_or_a_solution_without_velocity():
         thrown.problem.restore(state)
     d = decomposed("quadrilateral", 3)
     V, a, L = forms(d.mesh, d.facet_tags, (0.0, -0.1), d.surface("top"))
-    still = tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d)
-    still.solve()
+    still = solved(tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d))
     with pytest.raises(tfeti.InputError, match="no velocity: expected the solution of a Contact"):
         still.solution.velocity  # noqa: B018
 
@@ -244,7 +244,7 @@ def test_a_light_body_gets_its_momentum_from_the_force_on_it(comm):
     thrown, now = fem.Function(V), fem.Function(V)
     thrown.interpolate(lambda x: (0.0 * x[0], -0.1 * (x[1] > 0.01)))
     now.x.array[:] = thrown.x.array
-    a, L = ufl.inner(hooke()(u), strain(v)) * ufl.dx, drawn(d, "lower left", (0.02, 0.0))
+    a, L = elastic(u, v), drawn(d, "lower left", (0.02, 0.0))
     contacts, given = [sided("upper bottom", "lower top", reach=1.0)], {"velocity": thrown}
     given |= {"mass": 1.0 - (1.0 - 1e-5) * above, "petsc_options": {"rtol": 1e-2}}
     L, bcs = L(v, measures(d)[1]), [clamp(V, d.facets("lower bottom"))]

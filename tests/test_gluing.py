@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bodies import dofs_on, gathered, nodal
 from dolfinx import fem
-from scenes import clamp, curved_obstacle, decomposed
+from scenes import clamp, curved_obstacle, decomposed, roller
 from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
@@ -96,14 +96,11 @@ def test_dirichlet_rows_hold_every_copy_with_its_value():
 def test_a_dirichlet_value_reaches_copies_that_have_no_facet_on_the_surface():
     d = decomposed("triangle", 2, subdomains=lambda x: np.arange(x.shape[1]))
     dofs = dofs_on(d)
-    V = dofs.V
-    left = fem.locate_dofs_topological(V.sub(1), 1, d.facets("left"))
-    records = concatenate([], 2)
-    ones = np.ones(dofs.num_nodes * 2)
-    bcs = [fem.dirichletbc(0.5, left, V.sub(1))]
-    gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, ones)
+    left = fem.locate_dofs_topological(dofs.V.sub(1), 1, d.facets("left"))
+    held = prescribe(dofs, [roller(dofs.V, 1, d.facets("left"), 0.5)])
+    gluing = glue(dofs, held, concatenate([], 2), 1.0, np.ones(dofs.num_nodes * 2))
     found = d.comm.allreduce(int(np.sum(np.isclose(gluing.constraints.c, 0.5))))
-    x = V.tabulate_dof_coordinates()
+    x = dofs.V.tabulate_dof_coordinates()
     assert found == d.comm.allreduce(int(np.sum(np.isclose(x[:, 0], 0))))
     assert found > d.comm.allreduce(len(left))
 
@@ -136,10 +133,8 @@ def test_prescribed_components_move_into_the_gap():
     slanted = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (3, 0, 4)))
     d = decomposed("hexahedron", 2, 2)
     dofs = dofs_on(d)
-    V = dofs.V
-    bottom = fem.locate_dofs_topological(V.sub(0), 2, d.facets("bottom"))
     records = concatenate([slanted.records(dofs, 0, np.inf, np.inf)], 3)
-    bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]
+    bcs = [roller(dofs.V, 0, d.facets("bottom"), 1.0)]
     gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
     rows = gluing.constraints.sets.normals
     gap = gluing.constraints.c[rows] / gluing.contact.scale

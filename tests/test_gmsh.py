@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import displacement, integral, measures, problem, relative
+from scenes import by_point, displacement, integral, measures, problem, relative
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError
@@ -205,9 +205,7 @@ def table(d, entities, dim, *columns):
     """Midpoints of entities and columns beside them, of all ranks, sorted by midpoint."""
     d.mesh.topology.create_connectivity(dim, d.mesh.topology.dim)
     middle = dmesh.compute_midpoints(d.mesh, dim, np.asarray(entities, dtype=np.int32))
-    rows = np.column_stack((middle.reshape(-1, 3), *columns))
-    rows = np.concatenate(d.comm.allgather(rows))
-    return rows[np.lexsort(np.rint(rows.T * 1e7))]
+    return by_point(d.comm, np.column_stack((middle.reshape(-1, 3), *columns)))[0]
 
 
 def cells_of(d, ids=True):
@@ -222,9 +220,7 @@ def facets_of(d):
 
 
 def nodes_of(d, ids=True):
-    rows = np.column_stack((d.mesh.geometry.x, d.original_nodes * ids))
-    rows = np.concatenate(d.comm.allgather(rows))
-    return rows[np.lexsort(np.rint(rows.T * 1e7))]
+    return by_point(d.comm, np.column_stack((d.mesh.geometry.x, d.original_nodes * ids)))[0]
 
 
 def check_same(whole, split, ids=True):

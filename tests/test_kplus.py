@@ -46,7 +46,6 @@ def test_a_generalised_inverse(cell, degree, kernel, n):
     assert np.linalg.eigvalsh(pinv).min() >= -1e-11 * largest
     free = np.eye(len(K)) - b.kernel @ b.kernel.T
     assert np.allclose(free @ pinv @ free, pinvh(K, rtol=1e-12), rtol=0, atol=1e-9 * largest)
-    b.destroy()
 
 
 def test_published_checks_hold_and_find_what_is_wrong():

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from bodies import drawn, two_body_problem
+from bodies import clamped, drawn, two_body_problem
 from dolfinx import fem
 from reference.untorn import on_plane, untorn_box
-from scenes import clamp, decomposed, displacement
+from scenes import decomposed, displacement
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.solve.coulomb import FrictionBounds
@@ -22,16 +22,16 @@ def scene(seed):
     gdim = 3 if cell == "tetrahedron" else 2
     n, subdomains = int(rng.integers(2, 4 if gdim == 3 else 9)), int(rng.integers(2, 5))
     mu = float(np.exp(rng.uniform(np.log(0.05), np.log(3.0))))
-    clamped, loaded = PLACES[rng.integers(len(PLACES))]
+    held, loaded = PLACES[rng.integers(len(PLACES))]
     loads = [
         np.r_[rng.uniform(-0.06, 0.06, gdim - 1), rng.uniform(-0.08, 0.01)]
         * 10.0 ** min(0.0, rng.uniform(-2.0, 4.0))
         for _ in range(rng.integers(2, 6))
     ]
-    return cell, n, subdomains, mu, rng.random() < 0.5, clamped, loaded, 0.01 * (seed % 2), loads
+    return cell, n, subdomains, mu, rng.random() < 0.5, held, loaded, 0.01 * (seed % 2), loads
 
 
-def steps(cell, n, subdomains, mu, accepts, clamped, loaded, gap, loads, **options):
+def steps(cell, n, subdomains, mu, accepts, held, loaded, gap, loads, **options):
     """Solve all steps: each has to be right to what it reports."""
     d = decomposed(cell, n, subdomains)
     gdim = d.mesh.geometry.dim
@@ -40,9 +40,8 @@ def steps(cell, n, subdomains, mu, accepts, clamped, loaded, gap, loads, **optio
     floor = tfeti.Obstacle(
         "bottom", tfeti.Plane(-gap * up, up), friction=tfeti.Coulomb(mu), reach=np.inf
     )
-    bcs = lambda V: [clamp(V, d.facets(clamped))]  # noqa: E731
-    p = two_body_problem(d, drawn(d, loaded, t), bcs, [floor], **options)
-    untorn = untorn_box(cell, n, np.zeros(gdim), (clamped,), loaded=loaded)
+    p = two_body_problem(d, drawn(d, loaded, t), clamped(d, held), [floor], **options)
+    untorn = untorn_box(cell, n, np.zeros(gdim), (held,), loaded=loaded)
     frame, units = np.vstack((-up, np.eye(gdim)[:-1])), untorn.loads(loaded)
     law, reports = on_plane(untorn, [mu] * (gdim - 1), frame, gap, coulomb=True), []
     for load in loads:

@@ -60,7 +60,6 @@ def test_more_solves_make_S_as_soon_as_they_multiply_by_it():
     assert scene.problem.report.factorizations == count
     assert 0 < scene.problem.report.preconditioner_multiplications < first
     assert apart(scene.problem.solution.u, scene.fresh(load=-0.08).u) <= 1e-8
-    scene.problem.destroy()
 
 
 def test_it_is_chosen_for_large_subdomains_in_space_alone():

@@ -102,8 +102,6 @@ def test_it_finds_what_the_fixed_point_finds(options):
     assert p.report.friction_newton_steps > 0 == fixed_point.report.friction_newton_steps
     assert p.report.converged_reason == "CONVERGED_RTOL"
     assert np.abs(u - expected).max() <= 1e-7 * np.abs(expected).max()
-    p.destroy()
-    fixed_point.destroy()
 
 
 def test_laws_of_both_kinds_in_one_scene():
@@ -127,4 +125,3 @@ def test_the_same_load_again_takes_no_step():
     p.solve()
     assert p.report.friction_newton_steps == 0
     assert p.report.F_multiplications <= 2
-    p.destroy()

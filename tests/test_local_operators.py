@@ -78,8 +78,6 @@ def test_all_forms_apply_the_same(cell, equal):
     u, v = (applied(s.local_operator("pinv"), balanced) for s in (subdomains, single))
     assert apart(balanced @ u, balanced @ v) <= 1e-10
     check_operator(p.dual.F, d.comm, len(p.dual.d))
-    for item in (p, alone, explicit):
-        item.destroy()
 
 
 def test_equal_subdomains_are_factored_once():
@@ -95,7 +93,6 @@ def test_equal_subdomains_are_factored_once():
     p, subdomains = made(d, "implicit", tfeti_pc_type="lumped")
     assert p._system.how.factorizations == len(subdomains.blocks)
     assert len({id(block.stiffness) for block in subdomains.blocks}) == len(subdomains.blocks)
-    p.destroy()
 
 
 @pytest.mark.parametrize(
@@ -147,7 +144,6 @@ def test_friends_in_another_place_and_order(cell, equals):
     check_block(second, moved)
     first.destroy()
     check_block(second, moved)  # who stays keeps the factor
-    second.destroy()
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])

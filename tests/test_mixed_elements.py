@@ -2,8 +2,8 @@
 
 import numpy as np
 import ufl
-from bodies import boxes, held, sided
-from scenes import displacement, vectors
+from bodies import held, sided, torn_boxes
+from scenes import displacement, solved, vectors
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.compat import geometry_dofmap
@@ -18,17 +18,12 @@ KINDS = {
 def blocks(n):
     """A block on one of half its modulus, which it touches in a part of its bottom."""
     parts = [("lower", (0.0, -1.0), (1.0, 0.0), (n, n)), ("upper", (0.0, 0.0), (1.0, 1.0), (n, n))]
-    mesh, facet_tags, names = boxes("triangle", parts)
-    x, dofmap = mesh.geometry.x, geometry_dofmap(mesh)
+    volumes = {"lower": lambda x: x[1] <= 1e-9, "upper": lambda x: x[1] >= -1e-9}
+    d = torn_boxes("triangle", parts, lambda x: (x[1] > 0).astype(int), volumes=volumes)
+    x, dofmap = d.mesh.geometry.x, geometry_dofmap(d.mesh)
     of_upper = np.unique(dofmap[x[dofmap][:, :, 1].mean(axis=1) > 0.0])
     x[of_upper, 1] += (0.1 * x[:, 0] ** 2 * (1.0 - x[:, 1]))[of_upper]
-    return tfeti.decompose(
-        mesh,
-        lambda x: (x[1] > 0).astype(int),
-        facet_tags=facet_tags,
-        volumes={"lower": lambda x: x[1] <= 1e-9, "upper": lambda x: x[1] >= -1e-9},
-        surfaces=names,
-    )
+    return d
 
 
 def probed(n, elements, grid):
@@ -38,20 +33,14 @@ def probed(n, elements, grid):
     elastic = tfeti.Elasticity(d, E={"lower": 1.0, "upper": 2.0}, nu=0.3, model="plane_strain")
     ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
     pressure = 0.01 * (1 + ufl.SpatialCoordinate(d.mesh)[0])
-    p = tfeti.ContactProblem(
-        elastic.a(u, v),
-        -pressure * v[1] * ds(d.surface("upper top")),
-        held(d, "lower bottom", "lower left", "upper left")(V),
-        [sided("lower top", "upper bottom", reach=0.1)],
-        d,
-        petsc_options={"tfeti_rtol": 1e-8},
-        boundary_elements=elements,
-    )
-    p.solve()
+    L = -pressure * v[1] * ds(d.surface("upper top"))
+    bcs = held(d, "lower bottom", "lower left", "upper left")(V)
+    pair, more = [sided("lower top", "upper bottom", reach=0.1)], {"boundary_elements": elements}
+    more |= {"petsc_options": {"tfeti_rtol": 1e-8}}
+    p = solved(tfeti.ContactProblem(elastic.a(u, v), L, bcs, pair, d, **more))
     pressure = p.solution.contact(0).pressure
     assert 0.3 < d.comm.allreduce(np.sum(pressure > 0)) / d.comm.allreduce(len(pressure)) < 0.8
     x, found = displacement(p)
-    p.destroy()
     on_grid = np.all(np.abs(x * grid - np.rint(x * grid)) < 1e-6, axis=1)
     right = np.isclose(x[:, 0], 1.0) & (x[:, 1] < -1e-9)
     return found[on_grid & (np.isclose(x[:, 1], 1.0) | right)]

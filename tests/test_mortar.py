@@ -7,7 +7,7 @@ import pytest
 import ufl
 from bodies import (
     TO_ROUNDING,
-    boxes,
+    clamped,
     dofs_on,
     gathered,
     held,
@@ -16,11 +16,12 @@ from bodies import (
     searched,
     sided,
     stacked,
+    torn_boxes,
     two_body_problem,
 )
 from mpi4py import MPI
 from reference import mortar
-from scenes import CELLS, clamp, displacement, relative
+from scenes import CELLS, by_point, displacement, relative, solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import NoSolutionError
@@ -30,10 +31,6 @@ PAIR = sided("upper bottom", "lower top")
 
 def total(values):
     return MPI.COMM_WORLD.allreduce(np.sum(values, axis=0))
-
-
-def clamped(d, *sides):
-    return lambda V: [clamp(V, d.facets(side)) for side in sides]
 
 
 def tilted(d, push=0.07, pull=0.12):
@@ -99,16 +96,13 @@ def test_independent_active_set(cell, n, secondary):
     x_ref, u_ref, points, lam = mortar.lever(cell, *n, 0.07, 0.12, secondary)
     contact = PAIR if secondary == "upper" else sided(*PAIR.surfaces[::-1])
     for qp_type in ("newton", "smalse"):
-        problem = lever(cell, jagged, n, contact, qp_type=qp_type, **TO_ROUNDING)
-        problem.solve()
+        problem = solved(lever(cell, jagged, n, contact, qp_type=qp_type, **TO_ROUNDING))
         x, u = displacement(problem)
         assert np.allclose(x, x_ref)
         assert relative(u, u_ref) <= 1e-8
         data = problem.solution.contact()
-        place, force = gathered(data.points), gathered(data.force)
-        order = np.lexsort(np.rint(place.T * 1e7))
-        assert np.allclose(place[order], points)
-        force = force[order]
+        place, force = by_point(MPI.COMM_WORLD, data.points, data.force)
+        assert np.allclose(place, points)
         assert force.min() >= 0.0
         assert relative(force, lam) <= 1e-8
         assert np.array_equal(force > 1e-9 * lam.max(), lam > 1e-9 * lam.max())
@@ -137,10 +131,8 @@ def test_pairs_out_of_reach_join_when_they_overlap():
 
 def test_a_body_that_only_far_surfaces_hold_is_found():
     d = stacked("quadrilateral", 3, 4, 4, gap=0.2)
-    problem = two_body_problem(
-        d, pressed(d), held(d, "lower bottom", "lower left", "upper left"), [PAIR], rtol=1e-10
-    )
-    problem.solve()
+    bcs = held(d, "lower bottom", "lower left", "upper left")
+    problem = solved(two_body_problem(d, pressed(d), bcs, [PAIR], rtol=1e-10))
     assert problem.report.late_contact_rows == problem.report.contact_rows == 5
     assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, atol=1e-6)
 
@@ -154,15 +146,13 @@ def test_a_clamped_edge_bears_nothing_where_bodies_open(cell, degree):
         ("lower", (*low, -1.0), (*high, 0.0), (6, *(2,) * len(flat))),
         ("upper", (*low, 0.0), (*high, 1.0), (8, *(3,) * len(flat))),
     ]
-    mesh, tags, names = boxes(cell, parts)
-    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
+    d = torn_boxes(cell, parts, 4)
     load = pressed(d, -1e-4, "upper right")
     table = tfeti.Obstacle("upper bottom", tfeti.Plane((0, 0, 0), (0,) * len(flat) + (1,)))
     for contact in (PAIR, sided(*PAIR.surfaces[::-1]), table):
         for side in ("lower bottom", "lower left"):
             bcs = clamped(d, side, "upper left")
-            problem = two_body_problem(d, load, bcs, [contact], degree, **TO_ROUNDING)
-            problem.solve()
+            problem = solved(two_body_problem(d, load, bcs, [contact], degree, **TO_ROUNDING))
             assert np.all(problem.solution.contact().force == 0.0)
         overlap = replace(contact, gap=-1e-3)
         with pytest.raises(NoSolutionError, match="nodes? penetrates? by up to 0.001 whatever"):
@@ -176,8 +166,7 @@ def three(cell="quadrilateral"):
         ("right", (1.5, -1.0), (2.5, 0.0), (4, 4)),
         ("upper", (0.0, 0.0), (2.5, 1.0), (7, 3)),
     ]
-    mesh, tags, names = boxes(cell, parts)
-    return tfeti.decompose(mesh, 6, facet_tags=tags, surfaces=names)
+    return torn_boxes(cell, parts, 6)
 
 
 @pytest.mark.parametrize(
@@ -188,8 +177,7 @@ def test_a_surface_in_two_pairs(cell, upper_is_secondary):
     pairs = [("upper bottom", "left top"), ("upper bottom", "right top")]
     contacts = [sided(*(p if upper_is_secondary else p[::-1])) for p in pairs]
     bcs = held(d, "left bottom", "left left", "right bottom", "right left", "upper left")
-    problem = two_body_problem(d, pressed(d), bcs, contacts, **TO_ROUNDING)
-    problem.solve()
+    problem = solved(two_body_problem(d, pressed(d), bcs, contacts, **TO_ROUNDING))
     loads = np.sort(problem.solution.body_forces.force[:, 1])
     assert np.isclose(loads[-1], 0.25, atol=1e-9)
     assert np.isclose(loads.sum(), 0.0, atol=1e-9)

@@ -4,13 +4,13 @@ import sys
 
 import numpy as np
 import pytest
-import ufl
 from bodies import (
     TO_ROUNDING,
     boxes,
     dofs_on,
     gathered,
     held,
+    no_load,
     pressed,
     searched,
     sided,
@@ -18,7 +18,7 @@ from bodies import (
 )
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, decomposed, problem
+from scenes import clamp, decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 from meshes.cylinder_on_block import build
@@ -52,8 +52,7 @@ def test_only_the_first_of_two_layers_is_met(apart, radius):
     d = decomposed_boxes(parts, 6, [("tops", ["base top", "lower top"])])
     sides = ["base bottom", "base left", "lower left", "lower bottom", "upper left"]
     contact = sided("upper bottom", "tops", reach=radius)
-    p = two_body_problem(d, pressed(d), held(d, *sides), [contact], **TO_ROUNDING)
-    p.solve()
+    p = solved(two_body_problem(d, pressed(d), held(d, *sides), [contact], **TO_ROUNDING))
     assert np.allclose(gathered(p.solution.contact().pressure), 0.1, rtol=0, atol=1e-9)
     assert np.isclose(gathered(p.solution.contact().area).sum(), 1.0)
 
@@ -88,10 +87,6 @@ def disc_on_block(comm, order, pushed=0.02):
     return d, bcs
 
 
-def no_load(v, ds):
-    return ufl.ZeroBaseForm((v,))
-
-
 @pytest.mark.parametrize(("order", "sides"), [(1, ("top", "arc")), (2, ("arc", "top"))])
 def test_the_reach_does_not_change_the_answer(comm, order, sides):
     """Facets as large as the contact zone, and a load by displacement alone."""
@@ -99,8 +94,7 @@ def test_the_reach_does_not_change_the_answer(comm, order, sides):
     for radius in (None, 1e-3):
         d, bcs = disc_on_block(comm, order)
         contact = sided(*sides, reach=radius)
-        p = two_body_problem(d, no_load, bcs, [contact], rtol=1e-10)
-        p.solve()
+        p = solved(two_body_problem(d, no_load, bcs, [contact], rtol=1e-10))
         assert p.report.residuals["penetration"] <= p.report.tolerances["penetration"]
         forces.append(np.abs(p.solution.body_forces.force[:, 1]).max())
     assert min(forces) > 1e-3
@@ -115,8 +109,7 @@ def test_facets_of_second_order_touch_without_overlap(comm):
     forces = []
     for order in (1, 2):
         d, bcs = disc_on_block(comm, order)
-        p = two_body_problem(d, no_load, bcs, [sided("arc", "top")], rtol=1e-10)
-        p.solve()
+        p = solved(two_body_problem(d, no_load, bcs, [sided("arc", "top")], rtol=1e-10))
         records = searched(p.contacts, p.dofs)
         assert records.gap.min(initial=0.0) > -1e-12
         forces.append(np.abs(p.solution.body_forces.force[:, 1]).max())
@@ -127,8 +120,7 @@ def test_edges_are_warned_of(caplog):
     parts = [("lower", (0.0, -1.0), (1.0, 0.0), (3, 3)), ("upper", (0.0, 0.0), (1.0, 1.0), (4, 4))]
     d = decomposed_boxes(parts, 4, [("corner", ["upper bottom", "upper right"])])
     bcs = held(d, "lower bottom", "lower left", "upper left")
-    p = two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")])
-    p.solve()
+    solved(two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")]))
     assert ("'corner' has edges" in caplog.text) == (d.comm.rank == 0)
 
 
@@ -144,7 +136,6 @@ def test_an_obstacle_is_asked_about_its_surface_only():
     """A block in a hollow sphere, with a node at its centre, where the sphere has no normal."""
     d = decomposed("hexahedron", 2, 4)
     hollow = tfeti.Sphere((0.5, 0.5, 0.5), 2.0, inside=True)
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", hollow)], degree=2)
-    p.solve()
+    p = solved(problem(d, contacts=[tfeti.Obstacle("bottom", hollow)], degree=2))
     assert p.report.contact_candidates == 9
     assert p.report.converged_reason == "CONVERGED_RTOL"

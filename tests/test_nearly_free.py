@@ -4,11 +4,10 @@ import basix.ufl
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, drawn, two_body_problem
+from bodies import clamped, drawn, joined, no_load, torn_boxes, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from mpi4py import MPI
-from scenes import bumpy, clamp, decomposed, problem
+from scenes import bumpy, decomposed, exterior, problem, solved
 from true_errors import ring_problem
 
 import tfeti_dolfinx as tfeti
@@ -27,27 +26,14 @@ def ring(centre, inner, outer, layers, around, jitter, seed):
 
 def rings(parts, subdomains):
     """Rings in one mesh, each with its sides: ``in0``, ``out0``, ``in1``, ..."""
-    cells, points, start = [], [], 0
-    for part in parts:
-        x, c = ring(*part)
-        cells.append(start + c)
-        points.append(x)
-        start += len(x)
-    cells, points = np.concatenate(cells).astype(np.int64), np.concatenate(points)
-    if (comm := MPI.COMM_WORLD).rank:
-        cells, points = cells[:0], points[:0]
     element = basix.ufl.element("Lagrange", "quadrilateral", 1, shape=(2,))
-    mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element)
-    mesh.topology.create_connectivity(1, 2)
-    facets = dmesh.exterior_facet_indices(mesh.topology)
-    links = mesh.topology.connectivity(1, 2)
-    cell = np.array([links.links(f)[0] for f in facets], dtype=np.int32)
-    at, beside = (dmesh.compute_midpoints(mesh, d, e) for d, e in ((1, facets), (2, cell)))
+    mesh = joined([ring(*part) for part in parts], element)
+    facets, at, beside = exterior(mesh)
     values, names = np.zeros(len(facets), dtype=np.int32), {}
     for i, (centre, inner, outer, *_) in enumerate(parts):
-        own = np.linalg.norm(beside[:, :2] - centre, axis=1)
+        own = np.linalg.norm(beside - centre, axis=1)
         own = (own > inner * 0.9) & (own < outer)
-        outside = np.linalg.norm(at[:, :2] - centre, axis=1) > 0.5 * (inner + outer)
+        outside = np.linalg.norm(at - centre, axis=1) > 0.5 * (inner + outer)
         values[own] = 2 * i + 1 + outside[own]
         names |= {f"in{i}": 2 * i + 1, f"out{i}": 2 * i + 2}
     tags = dmesh.meshtags(mesh, 1, facets, values)
@@ -58,27 +44,25 @@ def ring_in_ring(subdomains, jitter, rtol):
     """Pressure inside the inner ring; the outer one is held outside."""
     parts = [((0, 0), 0.5, 1.0, 2, 24, jitter, 1), ((0, 0), 1.0, 1.5, 2, 36, jitter, 2)]
     d = rings(parts, subdomains)
-    return two_body_problem(
-        d,
-        lambda v, ds: -0.01 * ufl.dot(ufl.FacetNormal(d.mesh), v) * ds(d.surface("in0")),
-        lambda V: [clamp(V, d.facets("out1"))],
-        [tfeti.Contact("out0", "in1", reach=0.2)],
-        rtol=rtol,
-    )
+
+    def load(v, ds):
+        return -0.01 * ufl.dot(ufl.FacetNormal(d.mesh), v) * ds(d.surface("in0"))
+
+    pair = tfeti.Contact("out0", "in1", reach=0.2)
+    return two_body_problem(d, load, clamped(d, "out1"), [pair], rtol=rtol)
 
 
 def three_discs(subdomains, jitter):
     """Heavy discs in a row on a floor, a little apart from the walls beside them."""
     parts = [((2.0 * i, 0.0), 0.3, 1.0, 2, 20, jitter, i) for i in range(3)]
     d = rings(parts, subdomains)
-    weight = fem.Constant(d.mesh, np.array([0.0, -1e-3]))
     contacts = [tfeti.Contact(f"out{i}", f"out{i + 1}", reach=0.2) for i in range(2)]
     contacts += [tfeti.Obstacle(f"out{i}", tfeti.Plane((0, -1), (0, 1))) for i in range(3)]
     contacts += [
         tfeti.Obstacle("out0", tfeti.Plane((-1.01, 0), (1, 0))),
         tfeti.Obstacle("out2", tfeti.Plane((5.01, 0), (-1, 0))),
     ]
-    return two_body_problem(d, lambda v, ds: ufl.dot(weight, v) * ufl.dx, lambda V: [], contacts)
+    return two_body_problem(d, drawn(d, None, (0.0, -1e-3)), clamped(d), contacts)
 
 
 def motions(p):
@@ -102,8 +86,7 @@ def motions(p):
 def test_a_ring_in_an_even_ring_does_not_turn():
     """Nothing holds its turn, and of all turns none is the smallest."""
     for subdomains in (2, 5):
-        p = ring_in_ring(subdomains, 0.0, 1e-6)
-        p.solve()
+        p = solved(ring_in_ring(subdomains, 0.0, 1e-6))
         assert np.abs(motions(p)[:, 2]).max() <= 1e-8
         assert p.report.free_modes == 1
         (only,) = p.report.nearly_free
@@ -114,8 +97,7 @@ def test_a_ring_that_has_borne_no_force_sticks_before_it_slips():
     """Friction of no force would leave its turn to rounding."""
     fit = {"friction": tfeti.Coulomb(0.1), "gap": 0.0, "name": "fit"}
     for subdomains in (2, 12, 33):
-        p = ring_problem((16, 20), 1, {"subdomains": subdomains, "turn": 0.0}, 0.0, **fit)
-        p.solve()
+        p = solved(ring_problem((16, 20), 1, {"subdomains": subdomains, "turn": 0.0}, 0.0, **fit))
         p.update(gap={"fit": -1e-3})
         p.solve()
         assert p.report.F_multiplications <= 25
@@ -127,8 +109,7 @@ def test_fits_are_released_beside_one_that_stays():
     parts = [((x, 0), r, r + 0.6, 2, n, 0.05, i) for i, (x, r, n) in enumerate(given, 1)]
     d, fit = rings(parts, 5), {"gap": 0.0, "friction": tfeti.Coulomb(0.3)}
     fits = [tfeti.Contact(f"out{i}", f"in{i + 1}", secondary=f"out{i}", **fit) for i in (0, 1, 3)]
-    held, bcs = np.union1d(d.facets("out2"), d.facets("out4")), lambda V: [clamp(V, held)]
-    p = two_body_problem(d, lambda v, ds: ufl.ZeroBaseForm((v,)), bcs, fits, rtol=1e-8)
+    p = two_body_problem(d, no_load, clamped(d, "out2", "out4"), fits, rtol=1e-8)
     for overlaps in ((1, 0, 0), (1, 1, 1), (0, 0, 1)):
         p.update(gap={i: -1e-3 * o for i, o in enumerate(overlaps)})
         p.solve()
@@ -148,7 +129,7 @@ def test_a_light_pin_in_a_hole_bears_a_torque_up_to_its_angle_of_friction(gap):
         return 1e-5 * ufl.dot(pulls, v) * ds(d.surface("in0"))
 
     contact = tfeti.Contact("out0", "in1", friction=tfeti.Coulomb(0.3))
-    p = two_body_problem(d, load, lambda V: [clamp(V, d.facets("out1"))], [contact])
+    p = two_body_problem(d, load, clamped(d, "out1"), [contact])
     sine = 0.3 / np.hypot(1.0, 0.3) * (1.0 - gap)
     for share in (0.0, -0.5, 0.9, 0.3):
         torque.value = share * sine
@@ -167,8 +148,7 @@ def test_a_ring_that_polygons_hold_by_a_little():
     """Its turn follows from the meshes: small normals' errors hold it, which is said."""
     turns, held = [], []
     for subdomains in (2, 5):
-        p = ring_in_ring(subdomains, 0.05, 1e-8)
-        p.solve()
+        p = solved(ring_in_ring(subdomains, 0.05, 1e-8))
         turns.append(motions(p)[:, 2])
         (only,) = p.report.nearly_free
         assert only["mode"] == "rotation in the plane"
@@ -184,8 +164,7 @@ def test_three_discs_between_walls_are_held_alike_on_all_layouts(jitter, layouts
     """They may slide until they meet, which is said; how they stand is known."""
     results = []
     for subdomains in layouts:
-        p = three_discs(subdomains, jitter)
-        p.solve()
+        p = solved(three_discs(subdomains, jitter))
         results.append(motions(p)[:, 1])
         assert p.report.residuals["penetration"] <= p.report.tolerances["penetration"]
         assert p.report.residuals["gluing_jump"] <= p.report.tolerances["gluing_jump"]
@@ -201,8 +180,7 @@ def test_a_block_that_slides_freely_stays_where_it_is():
     for subdomains in (1, 4):
         d = decomposed("quadrilateral", 4, subdomains)
         floor = [tfeti.Obstacle("bottom", tfeti.Plane((0, -0.01), (0, 1)))]
-        p = problem(d, (0.0, -0.05), floor, clamped=(), tfeti_rtol=1e-9)
-        p.solve()
+        p = solved(problem(d, (0.0, -0.05), floor, clamped=(), tfeti_rtol=1e-9))
         assert abs(motions(p)[0, 0]) <= 1e-9
         only = {"bodies": ["body 0"], "mode": "translation in x", "stiffness": 0.0}
         assert p.report.nearly_free == [only]
@@ -220,8 +198,7 @@ def test_a_clamped_beam_needs_no_contact_to_hold_it():
 def test_forces_hold_a_light_body_beside_one_that_is_pressed(share, rtol):
     """They are small beside errors of the other's; of a third body, that nothing loads, none."""
     parts = [(name, (2.0 * i, 0.0), (2.0 * i + 1.0, 1.0), (8, 8)) for i, name in enumerate("abc")]
-    mesh, tags, names = boxes("triangle", parts)
-    d = tfeti.decompose(mesh, 6, facet_tags=tags, surfaces=names)
+    d = torn_boxes("triangle", parts, 6)
     floor = bumpy(0.002, 0.0)
     contacts = [tfeti.Obstacle(f"{name} bottom", floor) for name in "abc"]
 
@@ -230,7 +207,6 @@ def test_forces_hold_a_light_body_beside_one_that_is_pressed(share, rtol):
             v, ds
         )
 
-    p = two_body_problem(d, load, lambda V: [], contacts, rtol=rtol)
-    p.solve()
+    p = solved(two_body_problem(d, load, clamped(d), contacts, rtol=rtol))
     forces = [p.solution.contact(k).resultant.force[1] for k in range(3)]
     assert np.allclose(forces, (0.01, 0.01 * share, 0.0), rtol=1e-6, atol=0.0)

@@ -63,5 +63,3 @@ def test_it_finds_what_smalse_finds(name):
     assert newton.report.newton_faces > 0 == smalse.report.newton_faces
     assert newton.report.power_method_multiplications == 0
     assert newton.report.F_multiplications < smalse.report.F_multiplications
-    newton.destroy()
-    smalse.destroy()

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, drawn, held, stacked
+from bodies import drawn, held, stacked, torn_boxes
 from dolfinx import fem
 from reference.nonlinear import above_plane, block, by_dolfinx, nearest_nodes
-from scenes import accepted, clamp, decomposed, integral, largest, measures, unknowns
+from scenes import accepted, clamp, decomposed, integral, largest, measures, solved, unknowns
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import SimplePlasticity, neo_hooke
@@ -146,9 +146,7 @@ def plastic(comm, hardening=0.05, n=4, gdim=2, **more):
 
 def test_only_subdomains_with_a_new_tangent_are_factored_again(comm):
     """Of four layers the lowest yields: each new tangent costs its two factors."""
-    mesh, tags = block(2, 8, 0.05, comm)
-    layers = {"facet_tags": tags, "surfaces": {"low": 1, "top": 2}}
-    cut = tfeti.decompose(mesh, lambda x: np.clip(4 * x[1], 0, 3).astype(int), **layers)
+    cut = torn(comm, 2, 8, 0.05, lambda x: np.clip(4 * x[1], 0, 3).astype(int))
     V, u, v, _ = unknowns(cut)
     strength = fem.Function(fem.functionspace(cut.mesh, ("DG", 0)))
     strength.interpolate(lambda x: np.where(x[1] < 0.25, 0.01, 10.0))
@@ -236,8 +234,7 @@ def test_a_stiff_body_that_yields_beside_a_soft_one_is_as_right(comm):
     found, rtol = [], 1e-4
     for names in ("a", "ab"):
         parts = [(s, (2.0 * i, 0.0), (2.0 * i + 1.0, 1.0), (4, 4)) for i, s in enumerate(names)]
-        mesh, tags, sides = boxes("triangle", parts)
-        d = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=sides)
+        d = torn_boxes("triangle", parts, 3)
         V, u, v, w = unknowns(d)
         stiff = ufl.conditional(ufl.lt(ufl.SpatialCoordinate(d.mesh)[0], 1.5), 1e4, 1.0)
         elastic = tfeti.Elasticity(d, E=stiff, nu=NU, model="plane_strain")
@@ -267,10 +264,10 @@ def test_a_free_body_slides_on_both_sides(comm):
     """Between two others slips hardly tell its place: Q = μN drawn along, on, and back."""
     sizes = (("low", 0.0, 0.0, 8), ("mid", 1.0, 1.0, 5), ("up", 0.0, 2.0, 8))
     parts = [(name, (a, y), (4.0 - a, y + 1.0), (n, 2)) for name, a, y, n in sizes]
-    mesh, tags, names = boxes("quadrilateral", parts)
-    d = tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=names)
+    d = torn_boxes("quadrilateral", parts, 5)
     V, u, v, _ = unknowns(d)
-    law, value, mu = SimplePlasticity(u, E, NU, 0.03, 0.05, 2), fem.Constant(mesh, (0.0, 0.0)), 0.6
+    law, mu = SimplePlasticity(u, E, NU, 0.03, 0.05, 2), 0.6
+    value = fem.Constant(d.mesh, (0.0, 0.0))
     bcs = [clamp(V, d.facets("low bottom")), clamp(V, d.facets("up top"), value)]
     pairs = (("low top", "mid bottom"), ("mid top", "up bottom"))
     contacts = [tfeti.Contact(*pair, friction=tfeti.Coulomb(mu)) for pair in pairs]
@@ -335,8 +332,7 @@ def test_a_small_step_of_two_finite_bodies_is_linear():
     d, u, F, value, bcs = two_blocks(2, upper=(0.2, 0.7))  # facets are straight, u is not
     value.value, zero = -1e-3, ufl.ZeroBaseForm(F.arguments())
     contacts = [tfeti.Contact("upper bottom", "lower top", secondary="upper bottom")]
-    linear = tfeti.ContactProblem(ufl.derivative(F, u), zero, bcs, contacts, d)
-    linear.solve()
+    linear = solved(tfeti.ContactProblem(ufl.derivative(F, u), zero, bcs, contacts, d))
     accepted(tfeti.NonlinearContactProblem(F, u, bcs, contacts, d, finite=True))
     assert largest(u.x.array - linear.u.x.array) < 3e-6
 

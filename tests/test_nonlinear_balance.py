@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, stacked
+from bodies import boxes, clamped, stacked, torn_boxes
 from dolfinx import fem
 from reference.nonlinear import pressed_ring
-from scenes import accepted, integral, largest, unknowns
+from scenes import accepted, integral, largest, roller, solved, unknowns
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
@@ -17,21 +17,11 @@ PAIR = ("lower top", "upper bottom")
 
 
 def hyperelastic(decomposition, conditions, *contacts, rtol=1e-10):
-    """Bodies of neo-Hooke in contact.
-
-    ``conditions`` makes surfaces from V, each with a component, None for all, and its value.
-    """
-    gdim = decomposition.mesh.geometry.dim
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
-    u, bcs = fem.Function(V), []
-    for surface, i, value in conditions(V):
-        space = V if i is None else V.sub(i)
-        dofs = fem.locate_dofs_topological(space, gdim - 1, decomposition.facets(surface))
-        own = () if isinstance(value, fem.Function) else (space,)
-        bcs.append(fem.dirichletbc(value, dofs, *own))
-    F = ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, ufl.TestFunction(V))
+    """Bodies of neo-Hooke in contact; ``conditions`` makes those of Dirichlet from V."""
+    V, u, v, _ = unknowns(decomposition)
+    F = ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, v)
     options = {"finite": True, "petsc_options": {"rtol": rtol}}
-    return tfeti.NonlinearContactProblem(F, u, bcs, contacts, decomposition, **options)
+    return tfeti.NonlinearContactProblem(F, u, conditions(V), contacts, decomposition, **options)
 
 
 def test_a_scene_that_is_turned_has_no_stress(comm):
@@ -40,7 +30,7 @@ def test_a_scene_that_is_turned_has_no_stress(comm):
 
     def conditions(V):
         turned.append(fem.Function(V))
-        return [(side, None, turned[0]) for side in ("lower bottom", "upper top")]
+        return clamped(decomposition, ("lower bottom", turned[0]), ("upper top", turned[0]))(V)
 
     problem = hyperelastic(decomposition, conditions, tfeti.Contact(*PAIR), rtol=1e-11)
     (turn,), u = turned, problem.u
@@ -59,7 +49,7 @@ def test_a_scene_that_is_turned_has_no_stress(comm):
 def moving(decomposition, *fixed):
     """Conditions that fix surfaces and move the upper one, and where it is moved to."""
     way = fem.Constant(decomposition.mesh, (0.0, 0.0))
-    return way, lambda V: [("upper top", None, way), *((s, None, np.zeros(2)) for s in fixed)]
+    return way, clamped(decomposition, ("upper top", way), *fixed)
 
 
 @pytest.mark.parametrize("scene", [(4, 3, 0.8, 0.1, "auto"), (8, 5, 0.7, 0.6, PAIR[1])])
@@ -91,8 +81,7 @@ def test_forces_balance_and_friction_only_dissipates(scene, comm):
 def test_moments_balance_about_where_bodies_are(comm):
     """A block drawn over a plane and turned: forces act at X + u."""
     parts = [("upper", (0.0, 0.0), (2.0, 1.0), (6, 3))]
-    mesh, tags, names = boxes("triangle", parts, comm)
-    decomposition = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
+    decomposition = torn_boxes("triangle", parts, 3)
     way, conditions = moving(decomposition)
     plane = tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0))
     ground = tfeti.Obstacle("upper bottom", plane, friction=tfeti.Coulomb(0.3))
@@ -104,6 +93,9 @@ def test_moments_balance_about_where_bodies_are(comm):
         assert np.allclose(held.force, -pushed.force, rtol=0, atol=1e-9 * size)
         assert np.allclose(held.moment, -pushed.moment, rtol=0, atol=1e-9 * size)
     assert abs(held.moment[2]) > 0.01
+
+
+ENDS = (("left", 1), ("right", 0))  # of a quarter ring, and what is held there
 
 
 def rings(comm, n):
@@ -131,16 +123,13 @@ def test_moments_balance_on_a_flat_interface(comm):
     decomposition = stacked("triangle", 4, 3, 3, upper=(0.2, 0.8))
     way, conditions = moving(decomposition, "lower bottom")
     V, u, v, w = unknowns(decomposition)
-    bcs = [
-        fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, decomposition.facets(side)), V)
-        for side, _, value in conditions(V)
-    ]
     elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
     steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.02, hardening=0.1)
     contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.3))
     given = {"J": steel.tangent(w, v), "state": steel.state, "update": steel.update}
+    given["petsc_options"] = {"rtol": 1e-9}
     problem = tfeti.NonlinearContactProblem(
-        steel.residual(v), u, bcs, [contact], decomposition, petsc_options={"rtol": 1e-9}, **given
+        steel.residual(v), u, conditions(V), [contact], decomposition, **given
     )
     for way.value[:] in ((0.0, -0.05), (0.03, -0.06)):
         accepted(problem)
@@ -155,9 +144,9 @@ def test_moments_balance_to_h_squared_on_a_curved_interface(comm):
     for n in (1, 2, 4):
         decomposition, ways = rings(comm, n), []
 
-        def conditions(V, ways=ways):
+        def conditions(V, d=decomposition, ways=ways):
             ways.append(fem.Function(V))
-            return [("upper top", None, ways[0]), ("lower bottom", None, np.zeros(2))]
+            return clamped(d, ("upper top", ways[0]), "lower bottom")(V)
 
         contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.3))
         problem = hyperelastic(decomposition, conditions, contact, rtol=1e-9)
@@ -179,16 +168,15 @@ def test_a_curved_patch_is_right_to_h_squared(comm):
     for n in (2, 4):
         decomposition = rings(comm, n)
 
-        def conditions(V):
+        def conditions(V, d=decomposition):
             way = fem.Function(V)
             way.interpolate(lambda p: widened * p[:2] / np.hypot(p[0], p[1]))
-            along = [(f"{name} left", 1, 0.0) for name in ("lower", "upper")]
-            across = [(f"{name} right", 0, 0.0) for name in ("lower", "upper")]
-            return [("lower bottom", None, way), *along, *across]
+            sides = [(f"{name} {side}", k) for name in ("lower", "upper") for side, k in ENDS]
+            rollers = [roller(V, k, d.facets(side)) for side, k in sides]
+            return [*clamped(d, ("lower bottom", way))(V), *rollers]
 
         contact = tfeti.Contact(*PAIR, gap="curved")
-        problem = hyperelastic(decomposition, conditions, contact, rtol=1e-8)
-        problem.solve()
+        problem = solved(hyperelastic(decomposition, conditions, contact, rtol=1e-8))
         x = problem.u.function_space.tabulate_dof_coordinates()[:, :2]
         u, R = problem.u.x.array.reshape(-1, 2), np.linalg.norm(x, axis=1)
         exact = (radius(R) / R - 1.0)[:, None] * x

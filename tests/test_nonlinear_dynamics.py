@@ -9,7 +9,7 @@ from dolfinx import mesh as dmesh
 from moving import Thrown
 from mpi4py import MPI
 from reference.nonlinear import block, by_dolfinx, nearest_nodes
-from scenes import accepted, decomposed, hooke, largest, strain, unknowns
+from scenes import accepted, decomposed, elastic, largest, unknowns
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
@@ -116,7 +116,7 @@ def test_a_linear_body_takes_the_steps_of_the_linear_problem(stabilised, comm):
     d = decomposed("quadrilateral", 3, 4)
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
     u, v, weight = fem.Function(V), ufl.TestFunction(V), fem.Constant(d.mesh, (0.0, -0.02))
-    F = ufl.inner(hooke()(u), strain(v)) * ufl.dx - ufl.dot(weight, v) * ufl.dx
+    F = elastic(u, v) - ufl.dot(weight, v) * ufl.dx
     velocity = fem.Function(V)
     velocity.x.array[:] = scene.problem._system.forms.inertia.motion.v
     plane = tfeti.Plane((0.0, -0.02), (0.0, 1.0))
@@ -180,10 +180,10 @@ def test_a_block_that_turns_on_another_one_gains_no_energy(comm):
     problem, kept = flying(d, thrown, [pair], rtol=1e-7, stabilised=True)
     begin = kept()
     problem.take_step(0.04)
-    for _ in range(30):
-        u = np.array(problem.solve().x.array)
+    for n in range(30):
+        u = np.array(problem.solve().x.array) if n % 6 == 0 else None
         accepted(problem)
-        assert largest(problem.u.x.array - u) <= 1e-7
+        assert u is None or largest(problem.u.x.array - u) <= 1e-7
         end = kept(problem.solution.velocity)
         assert end[:2] == pytest.approx(begin[:2], abs=1e-7)
         assert 0.9 * begin[3] <= end[3] <= 1.001 * begin[3]
@@ -252,8 +252,6 @@ def test_a_step_that_is_given_up_leaves_no_trace(comm):
 
 def test_mistakes_are_named(comm):
     problem, _ = rubber()
-    with pytest.raises(tfeti.InputError, match="the step has no size yet"):
-        problem.solve()
     with pytest.raises(tfeti.InputError, match="mass"):
         rubber(mass=-1.0)
     with pytest.raises(tfeti.InputError, match="load and stiffness are those of linear problems"):

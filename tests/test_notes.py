@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from bodies import held, pressed, sided, sides_of, stacked, two_body_problem
-from scenes import decomposed, problem
+from scenes import decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -14,8 +14,7 @@ import tfeti_dolfinx as tfeti
 def test_contacts_none_of_which_touches_are_said(height):
     d = decomposed("quadrilateral", 3)
     floor = [tfeti.Obstacle("bottom", tfeti.Plane((0, height), (0, 1)), reach=1.0)]
-    p = problem(d, contacts=floor)
-    p.solve()
+    p = solved(problem(d, contacts=floor))
     said = [note for note in p.report.notes if note.startswith("no contact touches")]
     if height < 0.0:
         contact = p.report.contact()
@@ -34,8 +33,7 @@ def test_contacts_none_of_which_touches_are_said(height):
 def test_friction_of_a_given_bound_acts_on_contacts_none_of_which_touches():
     floor = tfeti.Plane((0, -0.5), (0, 1))
     rubs = tfeti.Obstacle("bottom", floor, reach=1.0, friction=tfeti.Tresca(0.02))
-    p = problem(decomposed("quadrilateral", 3), contacts=[rubs], traction=(0.05, -0.05))
-    p.solve()
+    p = solved(problem(decomposed("quadrilateral", 3), contacts=[rubs], traction=(0.05, -0.05)))
     (contact,) = p.report.contacts
     assert contact.touching == 0
     assert contact.resultant == pytest.approx([0.02 * (1.0 - 1.0 / 6.0), 0.0])  # less the corner
@@ -45,8 +43,7 @@ def test_friction_of_a_given_bound_acts_on_contacts_none_of_which_touches():
 
 
 def test_no_contact_is_no_contact_that_does_not_touch():
-    p = problem(decomposed("quadrilateral", 3))
-    p.solve()
+    p = solved(problem(decomposed("quadrilateral", 3)))
     assert p.report.notes == []
 
 
@@ -61,8 +58,7 @@ def test_pressures_of_nodes_that_are_hardly_covered(cell, beyond, secondary, exp
     d = stacked(cell, 3, 4, 4, upper=(0.0, width), gap=gap)
     primary = {"lower top": "upper bottom", "upper bottom": "lower top"}[secondary]
     contact = sided(secondary, primary, name="faces")
-    p = two_body_problem(d, pressed(d, 0.1), held(d, *sides_of(cell)), [contact])
-    p.solve()
+    p = solved(two_body_problem(d, pressed(d, 0.1), held(d, *sides_of(cell)), [contact]))
     found = [note for note in p.report.notes if note.startswith("faces: pressures go up to")]
     (summary,) = p.report.contacts
     load = 0.1 * width ** (d.mesh.geometry.dim - 1)

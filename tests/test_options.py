@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from petsc4py import PETSc
 from quick_demos import alone, process
-from scenes import STAGES, decomposed, problem
+from scenes import STAGES, decomposed, problem, solved
 
 from tfeti_dolfinx import InputError
 from tfeti_dolfinx.common.validation import parameters_of
@@ -95,8 +95,7 @@ def test_options_of_factors_are_let_through_and_no_others():
 
 def test_monitor_and_view_and_reason_print(capsys):
     d = decomposed("hexahedron", 2, 2)
-    p = problem(d, tfeti_monitor=True, tfeti_converged_reason=True, tfeti_view=True)
-    p.solve()
+    solved(problem(d, tfeti_monitor=True, tfeti_converged_reason=True, tfeti_view=True))
     out = capsys.readouterr().out
     words = ["|gP|", "|Qx|", "iterations", "TFETI solve CONVERGED_RTOL after"]
     words += ["-tfeti_rtol 1e-06", "primal_dofs"]

@@ -76,7 +76,6 @@ def test_a_set_that_changes_is_asked_for_before_each_solve():
         found.append(p.dofs.comm.allreduce(p.solution.force.min(initial=0.0), op=min))
     assert found[0] < -1e-3
     assert found[1] >= -1e-12
-    p.destroy()
 
 
 def test_glue_alone_holds_a_block_up_to_its_limit():

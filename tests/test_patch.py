@@ -5,7 +5,6 @@ import pytest
 from bodies import (
     ORDERS,
     TO_ROUNDING,
-    boxes,
     gathered,
     held,
     jagged,
@@ -13,12 +12,11 @@ from bodies import (
     sided,
     sides_of,
     stacked,
+    torn_boxes,
     two_body_problem,
 )
 from dolfinx import fem
-from scenes import clamp, largest
-
-import tfeti_dolfinx as tfeti
+from scenes import clamp, largest, solved
 
 PRESSURE = 0.1
 
@@ -74,10 +72,8 @@ def test_uniform_pressure_and_linear_displacement(cell, degree, subdomains, orde
     d = stacked(cell, 3, 4, subdomains)
     if moved:
         wavy(d)
-    problem = two_body_problem(
-        d, pressed(d, PRESSURE), held(d, *sides_of(cell)), [sided(*order)], degree, **TO_ROUNDING
-    )
-    problem.solve()
+    given = pressed(d, PRESSURE), held(d, *sides_of(cell)), [sided(*order)], degree
+    problem = solved(two_body_problem(d, *given, **TO_ROUNDING))
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
     assert error_of_displacement(problem) < 1e-9
     if degree < 3:
@@ -100,10 +96,9 @@ def test_uniform_pressure_between_bodies_that_are_held_all_around(cell, degree):
         return [clamp(V, d.facets(name), exact) for name in names]
 
     for order in ORDERS:
-        problem = two_body_problem(
-            d, pressed(d, PRESSURE), bcs, [sided(*order)], degree, **TO_ROUNDING
+        problem = solved(
+            two_body_problem(d, pressed(d, PRESSURE), bcs, [sided(*order)], degree, **TO_ROUNDING)
         )
-        problem.solve()
         assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
         assert np.isclose(np.abs(problem.solution.contact().resultant.force[-1]), PRESSURE)
         assert error_of_displacement(problem) < 1e-9
@@ -164,8 +159,7 @@ def test_overhanging_secondary_side(cell, subdomains, share):
         ("lower", (0.0,) * (gdim - 1) + (-1.0,), (1.0, *flat, 0.0), (3,) * gdim),
         ("upper", (0.0,) * gdim, (n * h, *flat, 1.0), (n,) * gdim),
     ]
-    mesh, tags, names = boxes(cell, parts)
-    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+    d = torn_boxes(cell, parts, subdomains)
     q = uncovered(d, PRESSURE)
 
     def load(v, ds):
@@ -173,8 +167,7 @@ def test_overhanging_secondary_side(cell, subdomains, share):
         return ends + q * v[gdim - 1] * ds(d.surface("upper bottom"))
 
     pair = sided("upper bottom", "lower top")
-    problem = two_body_problem(d, load, held(d, *sides_of(cell)), [pair], **TO_ROUNDING)
-    problem.solve()
+    problem = solved(two_body_problem(d, load, held(d, *sides_of(cell)), [pair], **TO_ROUNDING))
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
 
 
@@ -183,10 +176,8 @@ def test_force_and_moment_balance(cell, order):
     """Both sides overhang, nothing is uniform: still action equals reaction."""
     d = stacked(cell, 3, 4, jagged, upper=(0.3, 1.4))
     sides = ["lower bottom", "lower left", "upper left", "upper top"]
-    problem = two_body_problem(
-        d, pressed(d, 0.1, "upper right"), held(d, *sides), [sided(*order)], rtol=1e-10
-    )
-    problem.solve()
+    given = pressed(d, 0.1, "upper right"), held(d, *sides), [sided(*order)]
+    problem = solved(two_body_problem(d, *given, rtol=1e-10))
     forces = problem.solution.body_forces
     assert np.abs(forces.force).max() > 1e-3
     assert np.allclose(forces.force.sum(axis=0), 0.0, rtol=0, atol=1e-12)
@@ -199,9 +190,8 @@ def test_hardly_covered_facets_cost_nothing():
     for share in (0.5, 1e-3, 1e-8):
         d = stacked("quadrilateral", 3, 4, 4, upper=(0.0, 4 / (3 + share)))
         sides = [*sides_of("quadrilateral"), "upper right"]
-        problem = two_body_problem(
-            d, pressed(d), held(d, *sides), [sided("upper bottom", "lower top")]
+        problem = solved(
+            two_body_problem(d, pressed(d), held(d, *sides), [sided("upper bottom", "lower top")])
         )
-        problem.solve()
         taken.append(problem.report.F_multiplications)
     assert max(taken) <= 1.5 * taken[0]

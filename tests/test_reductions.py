@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
-from scenes import curved_obstacle, decomposed, problem
+from scenes import curved_obstacle, decomposed, problem, solved
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
@@ -98,16 +98,14 @@ def test_solvers_send_no_pickled_messages(pickled, qp_type, friction):
     d = stacked("quadrilateral", 4, 5)
     pair = sided("upper bottom", "lower top", friction=friction)
     sides = held(d, "lower bottom", "lower left", "upper left", ("upper top", -0.01))
-    p = two_body_problem(d, pressed(d), sides, [pair], tfeti_qp_type=qp_type)
-    p.solve()
+    p = solved(two_body_problem(d, pressed(d), sides, [pair], tfeti_qp_type=qp_type))
     assert p.report.F_multiplications > 5
     assert pickled == []
 
 
 def test_clusters_send_no_pickled_messages(pickled):
     pressed = tfeti.Obstacle("bottom", curved_obstacle(3))
-    p = problem(decomposed("hexahedron", 4, 8), contacts=[pressed], clusters=4)
-    p.solve()
+    p = solved(problem(decomposed("hexahedron", 4, 8), contacts=[pressed], clusters=4))
     assert p.report.F_multiplications > 5
     assert pickled == []
 
@@ -115,6 +113,5 @@ def test_clusters_send_no_pickled_messages(pickled):
 def test_pickled_messages_are_seen(pickled):
     """A monitor that sends a number, in each step."""
     seen = Extensions(monitor=lambda *_: MPI.COMM_WORLD.allreduce(1))
-    p = problem(decomposed("quadrilateral", 6, 4), extensions=seen)
-    p.solve()
+    solved(problem(decomposed("quadrilateral", 6, 4), extensions=seen))
     assert len(pickled) > 5

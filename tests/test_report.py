@@ -4,7 +4,7 @@ import json
 from dataclasses import fields, replace
 
 import pytest
-from scenes import STAGES, curved_obstacle, decomposed, problem
+from scenes import STAGES, curved_obstacle, decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import Report
@@ -13,8 +13,7 @@ from tfeti_dolfinx import Report
 @pytest.fixture(scope="module")
 def report():
     d = decomposed("hexahedron", 6, 8)
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.1)])
-    p.solve()
+    p = solved(problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.1)]))
     return p.report
 
 

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import ufl
-from bodies import boxes, two_body_problem
+from bodies import clamped, drawn, torn_boxes, two_body_problem
 from dolfinx import fem
-from scenes import apart, clamp, decomposed
+from scenes import apart, decomposed
 
 import tfeti_dolfinx as tfeti
 
@@ -67,8 +66,7 @@ def blocks(cell, n, gap):
         ("lower", (0.0,) * gdim, (1.0,) * gdim, (n,) * gdim),
         ("upper", low, high, (n + 1,) * gdim),
     ]
-    mesh, tags, names = boxes(cell, parts)
-    return tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=names)
+    return torn_boxes(cell, parts, 5)
 
 
 def friction(law, rng, Q):
@@ -94,14 +92,7 @@ def contact(two, friction, Q):
 def loaded(d, top, held, contacts):
     """The problem, and the traction on top."""
     t = fem.Constant(d.mesh, np.zeros(d.mesh.geometry.dim))
-    p = two_body_problem(
-        d,
-        lambda v, ds: ufl.dot(t, v) * ds(d.surface(top)),
-        lambda V: [clamp(V, d.facets(name)) for name in held],
-        contacts,
-        tfeti_rtol=1e-10,
-    )
-    return p, t
+    return two_body_problem(d, drawn(d, top, t), clamped(d, *held), contacts, rtol=1e-10), t
 
 
 # with 10 orthotropic Coulomb, and a bound of two values

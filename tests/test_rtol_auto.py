@@ -2,7 +2,7 @@
 
 import pytest
 from bodies import held, pressed, two_body_problem
-from scenes import clamp, curved_obstacle, decomposed, forms, hooke, problem
+from scenes import clamp, curved_obstacle, decomposed, forms, hooke, problem, solved
 from true_errors import AGAINST_FINER, error_against, stress_of_cells
 
 import tfeti_dolfinx as tfeti
@@ -24,8 +24,7 @@ def is_reached(p):
 
 @pytest.mark.parametrize(("scene", "sizes", "finest"), AGAINST_FINER)
 def test_it_saves_a_third_and_spoils_nothing(serial_only, scene, sizes, finest):
-    finer = scene(finest, rtol=1e-7)
-    finer.solve()
+    finer = solved(scene(finest, rtol=1e-7))
     reference = stress_of_cells(finer)
     for size in sizes:
         auto, exact = scene(size, rtol="auto"), scene(size, rtol=1e-8)
@@ -55,8 +54,7 @@ def test_all_solvers_reach_it(cell, qp_type, law):
     obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2, friction=LAWS[law])
     force, costs = (0.01,) + (0.0,) * (gdim - 2) + (-0.05,), []
     for rtol in ("auto", 1e-8):
-        p = problem(d, force, [obstacle], qp_type=qp_type, rtol=rtol)
-        p.solve()
+        p = solved(problem(d, force, [obstacle], qp_type=qp_type, rtol=rtol))
         costs.append(p.report.F_multiplications)
         assert bool(p.report.estimates) == (rtol == "auto")
         if rtol == "auto":
@@ -70,12 +68,10 @@ def test_all_solvers_reach_it(cell, qp_type, law):
 
 
 def test_without_contact_too():
-    p = problem(decomposed("tetrahedron", 5, 8), rtol="auto")
-    p.solve()
+    p = solved(problem(decomposed("tetrahedron", 5, 8), rtol="auto"))
     assert is_reached(p)
     assert p.report.converged_reason == "CONVERGED_RTOL"
-    exact = problem(decomposed("tetrahedron", 5, 8), rtol=1e-8)
-    exact.solve()
+    exact = solved(problem(decomposed("tetrahedron", 5, 8), rtol=1e-8))
     assert p.report.F_multiplications <= exact.report.F_multiplications * 2 / 3
 
 
@@ -83,8 +79,7 @@ def test_where_the_mesh_makes_no_error_it_ends():
     """A uniform stress: the algebraic error is compared with ‖u‖_K then."""
     d = decomposed("quadrilateral", 4, 4)
     bcs, stress = held(d, "bottom", "left"), hooke(1.0, 0.0)
-    p = two_body_problem(d, pressed(d, 0.01, "top"), bcs, [], stress=stress, rtol="auto")
-    p.solve()
+    p = solved(two_body_problem(d, pressed(d, 0.01, "top"), bcs, [], stress=stress, rtol="auto"))
     assert is_reached(p)
     assert p.report.estimates["discretisation"] <= 1e-5 * p.report.estimates["energy"]
     lifted = held(d, "left", ("top", 0.02))

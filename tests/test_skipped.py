@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ufl
-from bodies import two_body_problem
+from bodies import clamped, no_load, two_body_problem
 from quick_demos import process
-from scenes import clamp, curved_obstacle, decomposed, problem
+from scenes import curved_obstacle, decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -29,15 +29,13 @@ def test_only_the_dirichlet_preconditioner_factors_K_ii(contact, qp_type, pc_typ
     """Of equal subdomains that do not share their factors."""
     obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))] if contact else []
     options = {"local_type": "implicit", "qp_type": qp_type, "pc_type": pc_type}
-    p = problem(decomposed("hexahedron", 4, SUBDOMAINS), contacts=obstacles, **options)
-    p.solve()
+    p = solved(problem(decomposed("hexahedron", 4, SUBDOMAINS), contacts=obstacles, **options))
     assert p.report.factorizations == factors * SUBDOMAINS
     assert (p.report.preconditioner_multiplications == 0) == (pc_type in ("none", "auto"))
     p.solve()
     assert p.report.F_multiplications + p.report.power_method_multiplications <= 2
     assert p.report.preconditioner_multiplications == 0
     assert p.report.factorizations == p.report.coarse_factorizations == 0
-    p.destroy()
 
 
 @pytest.mark.parametrize("qp_type", ["pcpg", "smalse", "newton"])
@@ -46,21 +44,19 @@ def test_without_a_kernel_there_is_no_coarse_problem(qp_type):
     options = {"rtol": 1e-9, "qp_type": qp_type}
     d = decomposed("hexahedron", 3, 4)
     given = {"loaded": "bottom", "clamped": (), "springs": 100.0}
-    p = problem(d, (0.0, 0.0, -9.0), obstacles, **given, **options)
-    p.solve()
+    p = solved(problem(d, (0.0, 0.0, -9.0), obstacles, **given, **options))
     assert p.report.kernel_dim == p.report.coarse_factorizations == 0
     assert p.report.face_factorizations == 0
     assert p.report.soft_modes == 0
     assert (p.report.preconditioner_multiplications > 0) == (qp_type != "smalse")
     assert p.report.F_multiplications > 0
     assert (p.report.active_contacts > 0) == (qp_type != "pcpg")
-    p.destroy()
 
 
 LOADS = {
-    "none": lambda v: ufl.ZeroBaseForm((v,)),
-    "stress": lambda v: 0.02 * ufl.div(v) * ufl.dx,
-    "weight": lambda v: -0.05 * v[2] * ufl.dx,
+    "none": no_load,
+    "stress": lambda v, ds: 0.02 * ufl.div(v) * ufl.dx,
+    "weight": lambda v, ds: -0.05 * v[2] * ufl.dx,
 }
 
 
@@ -72,20 +68,12 @@ def test_without_a_force_on_a_subdomain_F_is_not_applied_at_the_start(load, qp_t
     d = decomposed("hexahedron", 4, 8)
     down = np.array((0.0, 0.0, -0.01 if load == "none" else 0.0))
     far = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -1), (0, 0, 1)), reach=2.0)]
-    contacts = far if qp_type == "newton" else []
-    p = two_body_problem(
-        d,
-        lambda v, ds: LOADS[load](v),
-        lambda V: [clamp(V, d.facets("left")), clamp(V, d.facets("right"), down)],
-        contacts,
-        qp_type=qp_type,
-    )
-    p.solve()
+    given = LOADS[load], clamped(d, "left", ("right", down)), far if qp_type == "newton" else []
+    p = solved(two_body_problem(d, *given, qp_type=qp_type))
     moves = load == "weight"
     assert np.any(p.dual.coarse.e) == moves
     assert p.report.cg_steps > 0
     assert p.report.F_multiplications == p.report.cg_steps + moves
-    p.destroy()
 
 
 HEAVY = """

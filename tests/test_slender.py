@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from bodies import boxes, pressed, two_body_problem
-from scenes import clamp, displacement, hooke
+from bodies import clamped, pressed, torn_boxes, two_body_problem
+from scenes import displacement, hooke, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -24,14 +24,11 @@ def cantilever(loaded, length, gap, subdomains=8):
     """
     tip = LOAD * FREE_TIP[loaded](length)
     parts = [("beam", (0.0, 0.0), (float(length), 1.0), (2 * length, 2))]
-    mesh, tags, names = boxes("quadrilateral", parts)
-    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+    d = torn_boxes("quadrilateral", parts, subdomains)
     plane = tfeti.Plane((0.0, -tip * (gap or 0.0)), (0.0, 1.0))
     contacts = [] if gap is None else [tfeti.Obstacle("beam bottom", plane, reach=np.inf)]
     pressure = pressed(d, LOAD / (length if loaded == "top" else 1.0), f"beam {loaded}")
-    bcs = lambda V: [clamp(V, d.facets("beam left"))]  # noqa: E731
-    p = two_body_problem(d, pressure, bcs, contacts, 2, hooke(E, NU))
-    p.solve()
+    p = solved(two_body_problem(d, pressure, clamped(d, "beam left"), contacts, 2, hooke(E, NU)))
     x, u = displacement(p)
     return p, -u[np.isclose(x[:, 0], length)][:, 1].max(), tip
 

@@ -2,11 +2,11 @@
 
 import pytest
 import ufl
-from bodies import two_body_problem
+from bodies import clamped, drawn, two_body_problem
 from dolfinx import fem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import box, decomposed, problem
+from scenes import box, decomposed, problem, solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
@@ -42,8 +42,7 @@ def test_a_load_that_turns_is_looked_at_again_and_one_that_grows_is_not(monkeypa
     d, weight = decomposed("quadrilateral", 4, 2), (0.0, -0.05)
     force = fem.Constant(d.mesh, weight)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
-    p = two_body_problem(d, lambda v, ds: ufl.dot(force, v) * ufl.dx, lambda V: [], [floor])
-    p.solve()
+    p = solved(two_body_problem(d, drawn(d, None, force), clamped(d), [floor]))
     force.value = (0.0, -0.15)
     before = len(asked)
     p.solve()
@@ -67,7 +66,7 @@ def test_solvable_just_if_the_resultant_is_over_the_support(centre, width):
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
     # of two points, exact for it times a hat
     p = two_body_problem(
-        d, lambda v, ds: -pressure * v[1] * ds(d.surface("top")), lambda V: [], [floor]
+        d, lambda v, ds: -pressure * v[1] * ds(d.surface("top")), clamped(d), [floor]
     )
     if 1e-3 < c < 1 - 1e-3:
         p.solve()

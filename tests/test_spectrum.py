@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from bodies import held, pressed, sided, sides_of, stacked, stiffer_above, two_body_problem
+from scenes import solved
 from scipy.sparse import csr_array
 
 # the rows alone matter: no step of the solver is made
@@ -15,8 +16,7 @@ def extremes(cell, n, subdomains, scaling="stiffness", pair=UP, stiffness=1.0):
     d = stacked(cell, *n, subdomains)
     stress = stiffer_above(d, stiffness)
     given = d, pressed(d), held(d, *sides_of(cell)), [sided(*pair)]
-    p = two_body_problem(*given, stress=stress, scaling=scaling, **ROWS_ONLY)
-    p.solve()
+    p = solved(two_body_problem(*given, stress=stress, scaling=scaling, **ROWS_ONLY))
     indptr, indices, data = p.dual.constraints.B.getValuesCSR()
     B = csr_array((data, indices, indptr), shape=p.dual.constraints.B.getSize())
     values = np.linalg.eigvalsh(((B / p.dual.constraints.weights) @ B.T).toarray())

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import boxes
+from bodies import clamped, no_load, torn_boxes, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import box, clamp, decomposed, forms, hooke, problem
+from scenes import box, clamp, decomposed, forms, hooke, problem, solved
 
 import tfeti_dolfinx as tfeti
 from benchmarks import stability
@@ -89,8 +89,7 @@ def test_displacements_of_degree_1_are_warned_of_where_a_material_keeps_its_volu
     d = decomposed("triangle", 3, 4)
     V, a, L = forms(d.mesh, d.facet_tags, (0, -0.01), d.surface("top"), degree, hooke(2.0, nu))
     bcs = [clamp(V, d.facets("left"))]
-    p = tfeti.ContactProblem(a, L, bcs, [], d)
-    p.solve()
+    p = solved(tfeti.ContactProblem(a, L, bcs, [], d))
     found = warnings_of("Poisson's ratio is about 0.495 ", p.report.warnings)
     assert len(found) == (1 if nu == 0.495 and degree == 1 else 0), p.report.warnings
     p.solve()
@@ -104,8 +103,7 @@ def test_warnings_can_be_switched_off():
 
     Of a small load nothing is warned.
     """
-    small = problem(decomposed("quadrilateral", 4, 4), traction=(0.0, -0.02))
-    small.solve()
+    small = solved(problem(decomposed("quadrilateral", 4, 4), traction=(0.0, -0.02)))
     assert small.report.warnings == []
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
     scenes = [{"traction": (0.0, -0.5)}, {"contacts": [floor], "clamped": ()}]
@@ -124,16 +122,11 @@ def test_warnings_can_be_switched_off():
 def test_a_body_that_turns_is_named_and_one_that_moves_is_not():
     """Rigid motions that are prescribed: a rotation by 0.2, a translation by 5."""
     parts = [("a", (0.0, 0.0), (1.0, 1.0), (2, 2)), ("b", (3.0, 0.0), (4.0, 1.0), (2, 2))]
-    mesh, tags, names = boxes("quadrilateral", parts)
-    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
-    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("a top"))
-    bcs = []
-    for name, motion in (("a", lambda x: np.stack((-0.2 * x[1], 0.2 * x[0]))), ("b", None)):
-        u = fem.Function(V)
-        u.interpolate(motion or (lambda x: np.full((2, x.shape[1]), 5.0)))
-        bcs.append(clamp(V, d.facets(f"{name} left"), u))
-    p = tfeti.ContactProblem(a, L, bcs, [], d)
-    p.solve()
+    d = torn_boxes("quadrilateral", parts, 4)
+    turn = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))))
+    turn.interpolate(lambda x: np.stack((-0.2 * x[1], 0.2 * x[0])))
+    bcs = clamped(d, ("a left", turn), ("b left", 5.0))
+    p = solved(two_body_problem(d, no_load, bcs, []))
     (found,) = warnings_of("radians", p.report.warnings)
     assert found.startswith(f"{d.body_names[0]}: parts turn by up to 0.2 radians")
 
@@ -183,8 +176,7 @@ def test_bodies_that_a_mesh_joins_in_nodes_alone_are_named(comm):
 
 
 def test_atol_is_a_length():
-    p = problem(decomposed("quadrilateral", 6, 4), tfeti_rtol=1e-14, tfeti_atol=1e-5)
-    p.solve()
+    p = solved(problem(decomposed("quadrilateral", 6, 4), tfeti_rtol=1e-14, tfeti_atol=1e-5))
     assert p.report.converged_reason == "CONVERGED_ATOL"
     assert p.report.residuals["gluing_jump"] <= 2e-5
 

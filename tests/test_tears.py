@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import ufl
-from bodies import two_body_problem
+from bodies import drawn, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from scenes import CELLS, decomposed, displacement
+from scenes import CELLS, clamp, decomposed, displacement, roller, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -18,16 +17,13 @@ def broad(x):
 
 
 def condition(V, facets, component=None):
-    W = V if component is None else V.sub(component)
-    dofs = fem.locate_dofs_topological(W, V.mesh.topology.dim - 1, facets)
-    return fem.dirichletbc(np.zeros(V.dofmap.bs) if component is None else 0.0, dofs, W)
+    return clamp(V, facets) if component is None else roller(V, component, facets)
 
 
 def problem(d, degree, conditions, **options):
     """The weight of a box, held by what is made from its space."""
-    weight = fem.Constant(d.mesh, (0.0,) * (d.mesh.geometry.dim - 1) + (-0.1,))
-    load = lambda v, ds: ufl.inner(weight, v) * ufl.dx(degree=2 * degree)  # noqa: E731
-    return two_body_problem(d, load, conditions, [], degree, **options)
+    weight = drawn(d, None, -0.1 * np.eye(d.mesh.geometry.dim)[-1])
+    return two_body_problem(d, weight, conditions, [], degree, **options)
 
 
 def shared(mesh, facets):
@@ -64,8 +60,7 @@ def test_a_marker_finds_the_boundary_alone(cell, degree):
         assert np.all(np.isin(facets, d.boundary))
         everything = dmesh.locate_entities_boundary(d.mesh, d.mesh.topology.dim - 1, broad)
         assert np.array_equal(facets, np.intersect1d(everything, d.boundary))
-        p = problem(d, degree, lambda V, f=facets: [condition(V, f)], rtol=1e-10)
-        p.solve()
+        p = solved(problem(d, degree, lambda V, f=facets: [condition(V, f)], rtol=1e-10))
         found.append(displacement(p)[1])
     assert np.abs(found[0]).max() > 1e-3
     assert np.allclose(*found, rtol=0.0, atol=1e-8 * np.abs(found[0]).max())

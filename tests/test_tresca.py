@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from bodies import boxes
+from bodies import torn_boxes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import untorn
-from scenes import clamp, decomposed, displacement, forms, hooke, problem
+from scenes import by_point, clamp, decomposed, displacement, forms, hooke, problem, solved
 
 import tfeti_dolfinx as tfeti
 
@@ -37,10 +37,7 @@ def nodal_data(solution, comm, contact=0):
     """Points of all conditions with their forces as vectors, sorted by point, on every rank."""
     data = solution.contact(contact)
     force = data.area[:, None] * data.tangential_traction - data.force[:, None] * data.normal
-    found = comm.allgather((data.points, force, data.status, data.slip))
-    points, *rest = (np.concatenate(part) for part in zip(*found, strict=True))
-    order = np.lexsort(np.rint(points.T * 1e7))
-    return points[order], *(part[order] for part in rest)
+    return by_point(comm, data.points, force, data.status, data.slip)
 
 
 def compare(p, u, x, force, frame, share=1e-7):
@@ -63,8 +60,7 @@ def on_the_plane(
     up = np.eye(gdim)[-1]
     law = law_of(kind, bounds, angle)
     plane = tfeti.Obstacle("bottom", tfeti.Plane(-gap * up, up), friction=law, reach=np.inf)
-    p = problem(d, traction, [plane], **EXACT, **more)
-    p.solve()
+    p = solved(problem(d, traction, [plane], **EXACT, **more))
     frame = frame_of(gdim, angle, -1.0)
     both = np.resize(bounds, gdim - 1)
     scene = untorn.untorn_box(cell, n, traction)
@@ -138,8 +134,7 @@ def two_boxes(
     cell, n, subdomains, traction, bounds, angle, secondary, kind=tfeti.Tresca, share=1e-7, **more
 ):
     gdim, apart = (2 if cell in ("triangle", "quadrilateral") else 3), 0.05
-    mesh, tags, names = boxes(cell, untorn.parts(gdim, n, n, apart))
-    d = tfeti.decompose(mesh, max(subdomains, 2), facet_tags=tags, surfaces=names)
+    d = torn_boxes(cell, untorn.parts(gdim, n, n, apart), max(subdomains, 2))
     V, a, L = forms(d.mesh, d.facet_tags, traction, d.surface("upper top"))
     clamped = ("lower bottom", "upper left")
     pair = tfeti.Contact(
@@ -152,8 +147,7 @@ def two_boxes(
     )
     bcs = [clamp(V, d.facets(name)) for name in clamped]
     options = {**EXACT, **more}
-    p = tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=options)
-    p.solve()
+    p = solved(tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=options))
     frame, both = frame_of(gdim, angle, 1.0), np.resize(bounds, gdim - 1)
     scene, coulomb = untorn.two_boxes(cell, traction, clamped, n, n, apart), kind is tfeti.Coulomb
     (below, area), (above, _) = scene.side("lower top"), scene.side("upper bottom")
