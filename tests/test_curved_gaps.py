@@ -35,9 +35,8 @@ def pushed_pin(sizes, contact, order=1, **mesh):
             dofs = fem.locate_dofs_topological(V.sub(axis), gdim - 1, d.facets(name))
             bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
     a = tfeti.Elasticity(d, E=210e3, nu=0.3, **law).a(u, v)
-    return tfeti.ContactProblem(
-        a, no_load(v, None), bcs, [contact], d, petsc_options={"rtol": 1e-7}
-    )
+    options = {"rtol": 1e-7}
+    return tfeti.ContactProblem(a, no_load(v, None), bcs, [contact], d, petsc_options=options)
 
 
 def pin_in_lug(sizes, gap="geometry", order=1, **mesh):
@@ -86,8 +85,7 @@ def test_a_pin_in_a_lug_with_curved_gaps(name):
 def test_facets_that_miss_each_other_are_warned_of():
     """The pin, finer, hangs between its nodes: it would touch, and no node has a force."""
     p = pin_in_lug((3.0, 0.75))
-    force, peak = force_and_peak(p)
-    assert force == peak == 0.0
+    assert not np.any(force_and_peak(p))
     assert any(text.startswith(SAYS) and "together by 0;" in text for text in p.report.warnings)
 
 
@@ -142,9 +140,8 @@ def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
     """Both have the same shape, 0.01 apart: at rims, in corners, and however coarse they are."""
     d = shaped(cell, 3, 5, height, lambda x: height(x) + 0.01)
     dofs = dofs_on(d)
-    flat, curved = (
-        searched([sided(*sides, reach=0.5, gap=gap)], dofs) for gap in ("geometry", "curved")
-    )
+    pairs = (sided(*sides, reach=0.5, gap=gap) for gap in ("geometry", "curved"))
+    flat, curved = (searched([pair], dofs) for pair in pairs)
     expected = 0.01 * np.abs(curved.normal[:, -1])
     flat, curved = (gathered(np.abs(records.gap - expected)).max() for records in (flat, curved))
     assert flat > 1e-3
@@ -156,9 +153,7 @@ def test_edges_are_not_rounded_off(cell, sides):
     """A roof of 90 degrees in another."""
     d = shaped(cell, 4, 6, lambda x: -np.abs(x[:, 0]), lambda x: 0.01 - np.abs(x[:, 0]))
     dofs = dofs_on(d)
-    found = [
-        gathered(searched([sided(*sides, reach=0.5, gap=gap)], dofs).gap)
-        for gap in ("geometry", "curved")
-    ]
+    pairs = (sided(*sides, reach=0.5, gap=gap) for gap in ("geometry", "curved"))
+    found = [gathered(searched([pair], dofs).gap) for pair in pairs]
     assert len(found[0]) > 0
     assert np.allclose(*found, rtol=0.0, atol=1e-12)
