@@ -1,8 +1,9 @@
 """Problems without a solution are recognised and explained, not iterated on."""
 
+import numpy as np
 import pytest
 import ufl
-from bodies import two_body_problem
+from bodies import boxes, two_body_problem
 from dolfinx import fem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -29,6 +30,26 @@ def test_what_moves_a_body_is_named(load, contact, says):
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))
     p = problem(d, load, [floor] if contact else [], clamped=())
     with pytest.raises(NoSolutionError, match=says):
+        p.solve()
+
+
+def test_an_arch_fails_where_blocks_turn_at_its_joints():
+    """A load a little beyond what rigid blocks bear: more friction nearly holds it."""
+    parts = [(f"{k}", (1.001 * k, 5.0), (1.001 * k + 1, 6.0), (4 + k % 2, 4)) for k in range(7)]
+    mesh, tags, names = boxes("quadrilateral", parts)
+    angle, r = np.pi * mesh.geometry.x[:, 0] / 7.006, mesh.geometry.x[:, 1].copy()
+    mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = -r * np.cos(angle), r * np.sin(angle)
+    d = tfeti.decompose(mesh, 7, facet_tags=tags, surfaces=names)
+    law, floor = {"friction": tfeti.Coulomb(0.7)}, tfeti.Plane((0, 0), (0, 1))
+    contacts = [tfeti.Contact(f"{k} right", f"{k + 1} left", gap=0.0, **law) for k in range(6)]
+    contacts += [tfeti.Obstacle(end, floor, **law) for end in ("0 left", "6 right")]
+    p = two_body_problem(
+        d,
+        lambda v, ds: -0.02 * v[1] * ufl.dx - 0.06 * v[1] * ds(d.surface("2 top")),
+        lambda V: [],
+        contacts,
+    )
+    with pytest.raises(NoSolutionError, match="free to move together"):
         p.solve()
 
 
