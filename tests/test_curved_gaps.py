@@ -136,24 +136,16 @@ def height(x):
 
 
 @pytest.mark.parametrize(("cell", "sides"), PAIRS)
-def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
-    """Both have the same shape, 0.01 apart: at rims, in corners, and however coarse they are."""
-    d = shaped(cell, 3, 5, height, lambda x: height(x) + 0.01)
-    dofs = dofs_on(d)
-    pairs = (sided(*sides, reach=0.5, gap=gap) for gap in ("geometry", "curved"))
+def test_surfaces_are_fitted_and_edges_are_not_rounded_off(cell, sides):
+    """Of one shape, 0.01 apart: of degree 2, rims, corners, however coarse; roofs of 90 degrees."""
+    pairs = [sided(*sides, reach=0.5, gap=gap) for gap in ("geometry", "curved")]
+    dofs = dofs_on(shaped(cell, 3, 5, height, lambda x: height(x) + 0.01))
     flat, curved = (searched([pair], dofs) for pair in pairs)
     expected = 0.01 * np.abs(curved.normal[:, -1])
     flat, curved = (gathered(np.abs(records.gap - expected)).max() for records in (flat, curved))
     assert flat > 1e-3
     assert curved < 0.12 * flat
-
-
-@pytest.mark.parametrize(("cell", "sides"), PAIRS)
-def test_edges_are_not_rounded_off(cell, sides):
-    """A roof of 90 degrees in another."""
-    d = shaped(cell, 4, 6, lambda x: -np.abs(x[:, 0]), lambda x: 0.01 - np.abs(x[:, 0]))
-    dofs = dofs_on(d)
-    pairs = (sided(*sides, reach=0.5, gap=gap) for gap in ("geometry", "curved"))
-    found = [gathered(searched([pair], dofs).gap) for pair in pairs]
+    roof = shaped(cell, 4, 6, lambda x: -np.abs(x[:, 0]), lambda x: 0.01 - np.abs(x[:, 0]))
+    found = [gathered(searched([pair], dofs_on(roof)).gap) for pair in pairs]
     assert len(found[0]) > 0
     assert np.allclose(*found, rtol=0.0, atol=1e-12)
