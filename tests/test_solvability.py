@@ -1,8 +1,9 @@
 """Problems without a solution are recognised and explained, not iterated on."""
 
+import numpy as np
 import pytest
 import ufl
-from bodies import clamped, drawn, two_body_problem
+from bodies import boxes, clamped, drawn, two_body_problem
 from dolfinx import fem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,22 +24,35 @@ from tfeti_dolfinx.feti.solvability import check_solvable
 )
 def test_what_moves_a_body_is_named(load, contact, says):
     mesh, tags, names = box("hexahedron", 2)
-    d = tfeti.decompose(
-        mesh, 3, facet_tags=tags, surfaces=names, volumes={"ball": lambda x: x[0] > -1}
-    )
+    ball = {"ball": lambda x: x[0] > -1}
+    d = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names, volumes=ball)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))
     p = problem(d, load, [floor] if contact else [], clamped=())
     with pytest.raises(NoSolutionError, match=says):
         p.solve()
 
 
+def test_an_arch_fails_where_blocks_turn_at_its_joints():
+    """A load a little beyond what rigid blocks bear: more friction nearly holds it."""
+    parts = [(f"{k}", (1.001 * k, 5.0), (1.001 * k + 1, 6.0), (4 + k % 2, 4)) for k in range(7)]
+    mesh, tags, names = boxes("quadrilateral", parts)
+    angle, r = mesh.geometry.x.T[:2] * [[np.pi / 7.006], [1.0]]
+    mesh.geometry.x[:, :2] = np.stack((-r * np.cos(angle), r * np.sin(angle)), axis=1)
+    d = tfeti.decompose(mesh, 7, facet_tags=tags, surfaces=names)
+    law, floor = {"friction": tfeti.Coulomb(0.7)}, tfeti.Plane((0, 0), (0, 1))
+    contacts = [tfeti.Contact(f"{k} right", f"{k + 1} left", gap=0.0, **law) for k in range(6)]
+    contacts += [tfeti.Obstacle(end, floor, **law) for end in ("0 left", "6 right")]
+    crowd, held = drawn(d, "2 top", (0.0, -0.06)), lambda V: []
+    p = two_body_problem(d, lambda v, ds: crowd(v, ds) - 0.02 * v[1] * ufl.dx, held, contacts)
+    with pytest.raises(NoSolutionError, match="free to move together"):
+        p.solve()
+
+
 def test_a_load_that_turns_is_looked_at_again_and_one_that_grows_is_not(monkeypatch):
     """A block that a floor alone holds: pressed, three times as hard, then pulled off it."""
     asked = []
-    monkeypatch.setattr(
-        "tfeti_dolfinx.feti.dual.check_solvable",
-        lambda *given: asked.append(check_solvable(*given)),
-    )
+    looks = "tfeti_dolfinx.feti.dual.check_solvable"
+    monkeypatch.setattr(looks, lambda *given: asked.append(check_solvable(*given)))
     d, weight = decomposed("quadrilateral", 4, 2), (0.0, -0.05)
     force = fem.Constant(d.mesh, weight)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))

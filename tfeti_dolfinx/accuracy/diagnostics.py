@@ -11,7 +11,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, joined, sum_rows, sums
-from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_degree, geometry_dofmap
 from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest
 from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.dual import Dual
@@ -85,6 +85,7 @@ class WarningLimits:
     flat: float = 500.0  # ‖J‖‖J⁻¹‖/gdim of a cell that is about 1000 times as long as thick
     # (λ + 2μ)/μ, 51 of ν = 0.49: from here on linear displacements are too stiff
     locks: float = 50.0
+    resists: float = 0.01  # of a body's energy, that by which curved cells resist to turn
     turns: float = 0.1  # radians; what linear kinematics takes for strain is half the square, 0.5 %
     # of what the largest pressure presses together: gaps that straight facets change by as much had
     # forces and pressures wrong by 4 to 10 %
@@ -110,7 +111,7 @@ class Diagnostics:
         self.finite = False
         self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
-        self._slopes: list[Array] = []
+        self._slopes: list[tuple[Array, Array]] = []
 
     def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
         """Sentences beside the ``outcome``, each of which names the thing. Collective."""
@@ -118,8 +119,8 @@ class Diagnostics:
             nodes = self._points(dual.subdomains)
             lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
-            # mean slopes of a displacement of each subdomain, (gdim, nodes)
-            self._slopes = [np.linalg.pinv(own, EPSILON * len(own)) for own in nodes]
+            # of each subdomain its points, and mean slopes of a displacement, (gdim, nodes)
+            self._slopes = [(own, np.linalg.pinv(own, EPSILON * len(own))) for own in nodes]
         u = solution.u
         return [
             *_loose(outcome),
@@ -201,10 +202,23 @@ class Diagnostics:
         bs = self._dofs.bs
         if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
-        angles = []
-        for (_, part), slope_of in zip(subdomains.elastic_parts, self._slopes, strict=True):
+        angles, turn = [], np.zeros_like(u)
+        for (_, part), (x, slope_of) in zip(subdomains.elastic_parts, self._slopes, strict=True):
             slope = slope_of @ u[part].reshape(-1, bs)
             angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
+            turn[part] = (x @ (slope - slope.T)).ravel() / 2.0
+        mesh, degree = self._decomposition.mesh, self._dofs.V.element.basix_element.degree
+        if geometry_degree(mesh) > degree and not self._dofs.axisymmetric:
+            each = [subdomains.energies(subdomains.with_rigid(of)) for of in (u, turn)]
+            energy, resists = subdomains.of_bodies(each)
+            stiff = resists > LIMITS.resists * energy
+            if np.any(stiff):
+                yield (
+                    f"{self._names(stiff)}: cells are curved and displacements have degree "
+                    f"{degree}, in which curved cells cannot turn without strain: that is up to "
+                    f"{(resists[stiff] / energy[stiff]).max():.1g} of the energy; expected "
+                    f"displacements of degree {geometry_degree(mesh)}, or a mesh of degree {degree}"
+                )
         worst = subdomains.of_bodies([angles], largest=True)[0]
         turned = worst > LIMITS.turns
         if np.any(turned):
@@ -250,7 +264,7 @@ class Diagnostics:
                     f"{contact.name}: facets are straight where the surfaces are curved, and "
                     f"change the gap, at most {most[2]:.2g} there, by up to {most[0]:.2g}, where "
                     f"the largest pressure presses elements together by {peaks[i] * most[1]:.2g}; "
-                    'expected gap="curved", a mesh of degree 2, or smaller facets'
+                    'expected gap="curved", mesh and displacements of degree 2, or smaller facets'
                 )
 
     def _points(self, subdomains: Subdomains) -> list[Array]:
@@ -342,8 +356,8 @@ def _overlapping(solution: Solution) -> Iterator[str]:
     for i in np.flatnonzero(pairs & (depth > LIMITS.overlaps * largest(comm, solution.u))):
         yield (
             f"{contacts[i].name}: the surfaces overlap by up to {depth[i]:.2g} as they are meshed, "
-            "and are pressed apart; where no interference is meant: expected smaller facets, a "
-            "mesh of degree 2, or gap= with the clearance"
+            "and are pressed apart; where no interference is meant: expected smaller facets, "
+            "mesh and displacements of degree 2, or gap= with the clearance"
         )
 
 

@@ -101,9 +101,11 @@ class RigidScene:
         y, value = minimised(np.concatenate((noise - load, noise + load, [1.0])), 1.0)
         if value >= -least or np.abs(y).max() <= 0.5:
             return None
-        # 2. the least motion (sum of moduli) of unit work, which leaves out what costs nothing
+        # 2. the least motion (sum of moduli) of that work, which leaves out what costs nothing; of
+        # unit work it is so large, where friction nearly holds, that the rows' tolerance forbids it
         work = csr_array(np.concatenate((load, -load, [-1.0]))[None, :])
-        y, _ = minimised(np.append(np.ones(2 * n), 0.0), None, A_eq=work, b_eq=np.ones(1))
+        gain = np.atleast_1d(noise @ np.abs(y) - value)
+        y, _ = minimised(np.append(np.ones(2 * n), 0.0), None, A_eq=work, b_eq=gain)
         largest = np.abs(y).max()
         return y / largest if largest > 0.0 else None
 

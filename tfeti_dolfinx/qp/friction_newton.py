@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.parallel import dot_over, norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.qp.coarse import HELD
 from tfeti_dolfinx.qp.problem import QP
-from tfeti_dolfinx.qp.recycling import Recycled, triangle
+from tfeti_dolfinx.qp.recycling import Recycled, right_singular
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
 
@@ -316,7 +316,7 @@ def known_on(
         return nothing
     U, FU = U @ N, FW @ N
     AU = project(FU + on.face.bend(U))
-    _, sizes, Vt = np.linalg.svd(triangle(past.comm, AU))
+    sizes, Vt = right_singular(past.comm, AU)
     kept = sizes > new * sizes[0]
     T = Vt[kept].T / sizes[kept]
     return np.stack([(X @ T).T for X in (AU, U, FU)])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from scipy.linalg import svd
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, dot_over, summed
@@ -126,7 +127,7 @@ class Recycled(DirectionStore):
 
         ``values`` is this rank's part, shape ``(l, count)``; N has the shape ``(count, k)``.
         """
-        _, sizes, Vt = np.linalg.svd(triangle(self.comm, values))
+        sizes, Vt = right_singular(self.comm, values)
         squares = summed(self.comm, np.sum(self.directions**2, axis=1))
         longest = float(np.sqrt(bcast_from_root(self.comm, float(squares.max(initial=0.0)))))
         return np.asarray(Vt[int(np.sum(sizes > self.parameters.held * longest)) :].T)
@@ -155,6 +156,18 @@ class Recycled(DirectionStore):
             return step, b
 
         return along if (self.count if N is None else N.shape[1]) else None
+
+
+def right_singular(comm: MPI.Intracomm, A: Array) -> tuple[Array, Array]:
+    """Singular values and right singular vectors of A, its rows spread over ranks. Collective.
+
+    LAPACK's gesdd gives up on some graded triangles; its gesvd, which is slower, does not.
+    """
+    R = triangle(comm, A)
+    try:
+        return np.linalg.svd(R)[1:]
+    except np.linalg.LinAlgError:
+        return svd(R, lapack_driver="gesvd")[1:]
 
 
 def triangle(comm: MPI.Intracomm, A: Array) -> Array:
