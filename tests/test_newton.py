@@ -7,13 +7,13 @@ from reference.untorn import check_optimal
 from test_newton_discs import solved
 from test_qp import bounds_on, matrix, vector
 
-from tfeti_dolfinx.qp.coarse import DenseCoarse
+from tfeti_dolfinx.qp.coarse import DenseCoarse, imbalance
 from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import first_point, newton
 from tfeti_dolfinx.qp.problem import QP, StoppingRule, homogenise, operator_product
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.sets import Bounds, Product
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Product
 
 
 def program(seed, kind="regular"):
@@ -59,6 +59,25 @@ def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
     coarse = DenseCoarse(np.array([[1.0, -stiff]]), np.ones(1))
     found, _ = project_onto_feasible(coarse, bounds_on(np.arange(2)), vector([0.0, -1.0 / stiff]))
     assert np.allclose(found, [1.0, 0.0], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_the_nearest_point_is_found_where_bounds_and_forces_are_far_apart(seed):
+    rng = np.random.default_rng(seed)
+    r, contact, friction = (int(rng.integers(low, 5)) for low in (2, 1, 1))
+    rows = contact + friction
+    G = rng.integers(-2, 3, (r, rows)) * 1.0
+    G /= np.maximum(np.linalg.norm(G, axis=1, keepdims=True), 1e-300)
+    bounds = 10.0 ** rng.integers(-5, 1, friction)
+    pressed = rng.integers(0, 3, contact)
+    rubbed = bounds * rng.integers(-1, 2, friction) * rng.choice([1.0, 0.5])
+    coarse = DenseCoarse(G, 0.5 * G @ np.r_[pressed, rubbed])
+    sides = [(slice(contact), Bounds()), (slice(contact, rows), Ellipses(bounds[:, None]))]
+    y = rng.integers(-3, 4, rows) * 10.0 ** rng.integers(-4, 2, rows)
+    found, alpha = project_onto_feasible(coarse, feasible := Product(sides), vector(y))
+    assert imbalance(coarse, found) < 1e-8
+    far = 1e-12 * max(np.abs(y).max(), np.abs(alpha).max(), 1.0)
+    assert np.allclose(found, feasible.project(y + G.T @ alpha), rtol=0.0, atol=far)
 
 
 def nearly_dependent(near=1e-6, m=60):

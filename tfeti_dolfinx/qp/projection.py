@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+from tfeti_dolfinx.common.parallel import bcast_from_root, steering, summed
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
@@ -35,8 +35,12 @@ class ProjectionParameters:
     # factor on the damping after a whole step that has met no row but it: those of the face may be
     # so soft beside open ones that they hold by less
     eased: float = 0.01
-    shortest: float = 1e-8  # of Newton's step: less changes nothing that is left above rounding
-    # of the slope at its start: a whole step that leaves as much has met only the damping
+    # factor on the damping where even `shortest` of a step is too far: up to 1, a gradient step
+    harder: float = 1e4
+    # of Newton's step, or of a part of it that is too long: a bracket so small is not divided
+    shortest: float = 1e-8
+    # of the slope at its start: a whole step that leaves as much has met only the damping; a part
+    # of one leaves no more
     left: float = 0.5
     # after so many of these in a row nothing in Ω fulfils Gλ = e but for rounding
     patience: int = 10
@@ -80,27 +84,24 @@ def project_onto_feasible(
         face = feasible.face(trial.lam, trial.lam - trial.z)
         step = coarse.damped_solve(face.damped(), trial.residual, damping)
         slope = float(trial.residual @ step)
-        # halve the step until it does not raise the cost; where that still falls at the end of a
-        # step, it fell along all of it, as it is convex, however rounding hides its difference
-        start, length = trial, 1.0
-        while True:
-            trial, trials = _trial(coarse, feasible, y, start.alpha + length * step), trials + 1
-            fell = trial.cost <= start.cost + parameters.rounding * abs(start.cost)
-            fell = fell or float(trial.residual @ step) >= 0.0
-            if bcast_from_root(comm, fell or length <= parameters.shortest):
+        trial, length, looks = _along(coarse, feasible, y, trial, step, parameters)
+        trials += looks
+        if length == 0.0:  # the rows of the face hardly hold
+            if damping >= 1.0:
                 break
-            length *= 0.5
+            damping = min(parameters.harder * damping, 1.0)
+            continue
         left = float(trial.residual @ step)
         whole = bcast_from_root(comm, length == 1.0 and left > parameters.left * slope)
         unmet = unmet + 1 if whole else 0
         if whole:
             damping = max(parameters.eased * damping, parameters.least_damping)
-        elif length < 1.0 and slowly == 0:
+        elif slowly == 0 and (length < 1.0 or damping > parameters.damping):
             damping = parameters.damping
         near = trial.left <= parameters.nearly * scale
         slow = bcast_from_root(comm, near and trial.left > parameters.slow * least)
         slowly, least = slowly + 1 if slow else 0, min(least, trial.left)
-        if bcast_from_root(comm, length <= parameters.shortest) or slowly > parameters.slowly:
+        if slowly > parameters.slowly:
             break
         if slow:
             damping = parameters.least_damping
@@ -150,3 +151,33 @@ def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: 
     (cost,), residual = summed(coarse.comm, np.array([own])), coarse.residual(lam)
     length = float(np.sqrt(residual @ residual))
     return _Trial(alpha, z, lam, residual, float(cost - alpha @ coarse.e), length)
+
+
+def _along(
+    coarse: Coarse,
+    feasible: FeasibleSet | WithinFace,
+    y: Array,
+    start: _Trial,
+    step: Array,
+    parameters: ProjectionParameters,
+) -> tuple[_Trial, float, int]:
+    """Return the point after a step, how much of it was taken, and how many points were tried.
+
+    All of it, if that does not raise the cost; else a bisection looks for where the slope has
+    fallen, too: rows that are met on the way may hold far more than those the step is made for.
+    """
+    slope, length, low, high, trials = float(start.residual @ step), 1.0, 0.0, np.inf, 0
+    while True:
+        trial, trials = _trial(coarse, feasible, y, start.alpha + length * step), trials + 1
+        left = float(trial.residual @ step)
+        # as it is convex the cost fell where it still falls, however rounding hides that
+        fell = trial.cost <= start.cost + parameters.rounding * abs(start.cost) or left >= 0.0
+        met = fell and (length == 1.0 or abs(left) <= parameters.left * slope)
+        met, short = (flag > 0.0 for flag in steering(coarse.comm, met, fell and left > 0.0))
+        if met:
+            return trial, length, trials
+        low, high = (length, high) if short else (low, length)
+        if high - low <= parameters.shortest * (high if low > 0.0 else 1.0):
+            end = _trial(coarse, feasible, y, start.alpha + low * step) if low > 0.0 else start
+            return end, low, trials
+        length = 0.5 * (low + high)
