@@ -228,6 +228,18 @@ def test_large_motions_place_the_tool_anew():
         assert same(*found, 1e-11)
 
 
+def test_a_surface_may_turn_away_from_a_tool_that_has_passed():
+    scene = block(2)
+    way = fem.Constant(scene["decomposition"].mesh, (0.2, -0.03))
+    tool = tfeti.RigidBody(ball(2, radius=0.3), displacement=way, large=True)
+    problem = solved(scene, tfeti.Obstacle("top", tool))
+    first = problem.u.x.array.copy()
+    for where, u in (((5.0, -3.0), 0.0 * first), ((0.2, -0.03), first)):
+        way.value = where
+        problem.solve()
+        assert np.allclose(problem.u.x.array, u, rtol=0.0, atol=1e-12)
+
+
 def test_a_wheel_that_turns_drags_along():
     """Its surface slips wherever the wheel was before; the second of two turns changes nothing."""
     scene = block(2, n=8)

@@ -248,6 +248,31 @@ class Obstacle(ContactPartner):
         """The surface."""
         return (self.surface,)
 
+    def settled(
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, flag: Flag = None
+    ) -> tuple[ContactPartner, ContactRecords]:
+        """Return the contact and its conditions. Collective.
+
+        At the first search the shape has to fit: later the surface may have turned away from it.
+        """
+        if stiffness is not None and dofs.bs > 1:  # of a scalar space the first component counts
+            self._check_shape(dofs)
+        return super().settled(dofs, contact, reach, stiffness, flag)
+
+    def _check_shape(self, dofs: TornDofs) -> None:
+        """Raise an InputError unless the gradient is the distance's and a facet faces the shape."""
+        surface = surface_facets(dofs.decomposition, self.surface)
+        facets = local_facets(dofs, surface, facet_kind(dofs))
+        centres, size = facets.corners.mean(axis=1), diameter(dofs.decomposition)
+        check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
+        with raised_on_all_ranks(dofs.comm):
+            _, towards = self._distances(centres, dofs.bs)
+        if count_over(dofs.comm, np.sum(towards * facets.normal, axis=1) > 0.0) == 0:
+            raise InputError(
+                f"{self.name}: the surface faces away from it; expected "
+                "a shape whose distance falls along the outward normal (is its normal turned?)"
+            )
+
     def records(
         self, dofs: TornDofs, contact: int, reach: float, depth: float, flag: Flag = None
     ) -> ContactRecords:
@@ -259,18 +284,7 @@ class Obstacle(ContactPartner):
         """
         kind = facet_kind(dofs)
         facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface), kind)
-        centres, corners = facets.corners.mean(axis=1), facets.corners
-        if dofs.bs > 1:  # of a scalar space the gradient's first component counts
-            size = diameter(dofs.decomposition)
-            check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
-        with raised_on_all_ranks(dofs.comm):
-            _, towards = self._distances(centres, dofs.bs)
-        facing = count_over(dofs.comm, np.sum(towards * facets.normal, axis=1) > 0.0)
-        if dofs.bs > 1 and facing == 0:
-            raise InputError(
-                f"{self.name}: the surface faces away from it; expected "
-                "a shape whose distance falls along the outward normal (is its normal turned?)"
-            )
+        corners = facets.corners
         with raised_on_all_ranks(dofs.comm):
             distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)
             beside, at_edge = self._beside_edges(facets, distance, towards)
