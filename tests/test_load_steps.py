@@ -325,6 +325,7 @@ def test_a_series_that_runs_again_after_an_error_writes_its_own_steps(shared_tmp
     steps = tfeti.LoadSteps(driven.problem, apply, [0.5, 1.0], path=shared_tmp / "again.bp")
     with pytest.raises(ZeroDivisionError):
         steps.run()
+    assert number_of_steps(shared_tmp / "again.bp") == 1  # the one before
     wrong.append(False)
     steps.run()
     assert number_of_steps(shared_tmp / "again.bp") == 2

@@ -280,13 +280,13 @@ class LoadSteps:
             given["resume"] = bool(resume)
             if resume and self._checkpoint is None:
                 raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
-        self._close(drop=True)  # a file that an error of the user's has ended
+        self._close(drop=True)  # a file that an interrupt has ended
         with nullcontext() if self._checkpoint is None else self._checkpoint.held():
             place = self._begin(resume)
             try:
                 with shown_progress(self._comm, self._progress) as show:
                     self._steps(place, show)
-            except TfetiError as error:  # on all ranks; the steps before it are whole
+            except Exception as error:  # on all ranks, of `apply` too; steps before it are whole
                 try:
                     self._close()
                 except TfetiError as another:
