@@ -418,7 +418,7 @@ def test_a_ball_that_rolls_off_a_block_in_a_step_asks_for_smaller_ones(way):
     law = {"displacement": lambda t: (way * t, 0.0), "force": (0.0, -0.2), "free": ("y",)}
     accepted(problem := nonlinear(True, tfeti.RigidBody(ball(2, 0.5), **law)))
     problem.time = 1.0
-    with pytest.raises(tfeti.ConvergenceError, match="(away|only contact).*; or smaller load"):
+    with pytest.raises(tfeti.ConvergenceError, match="only contact.*; or smaller load"):
         problem.solve()
 
 

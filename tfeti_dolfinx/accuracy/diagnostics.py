@@ -111,7 +111,7 @@ class Diagnostics:
         self.finite = False
         self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
-        self._slopes: list[tuple[Array, Array]] = []
+        self._slopes: list[Array] = []
 
     def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
         """Sentences beside the ``outcome``, each of which names the thing. Collective."""
@@ -119,8 +119,8 @@ class Diagnostics:
             nodes = self._points(dual.subdomains)
             lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
-            # of each subdomain its points, and mean slopes of a displacement, (gdim, nodes)
-            self._slopes = [(own, np.linalg.pinv(own, EPSILON * len(own))) for own in nodes]
+            # mean slopes of a displacement of each subdomain, (gdim, nodes)
+            self._slopes = [np.linalg.pinv(own, EPSILON * len(own)) for own in nodes]
         u = solution.u
         return [
             *_loose(outcome),
@@ -202,23 +202,12 @@ class Diagnostics:
         bs = self._dofs.bs
         if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
-        angles, turn = [], np.zeros_like(u)
-        for (_, part), (x, slope_of) in zip(subdomains.elastic_parts, self._slopes, strict=True):
+        turns = []
+        for (_, part), slope_of in zip(subdomains.elastic_parts, self._slopes, strict=True):
             slope = slope_of @ u[part].reshape(-1, bs)
-            angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
-            turn[part] = (x @ (slope - slope.T)).ravel() / 2.0
-        mesh, degree = self._decomposition.mesh, self._dofs.V.element.basix_element.degree
-        if geometry_degree(mesh) > degree and not self._dofs.axisymmetric:
-            each = [subdomains.energies(subdomains.with_rigid(of)) for of in (u, turn)]
-            energy, resists = subdomains.of_bodies(each)
-            stiff = resists > LIMITS.resists * energy
-            if np.any(stiff):
-                yield (
-                    f"{self._names(stiff)}: cells are curved and displacements have degree "
-                    f"{degree}, in which curved cells cannot turn without strain: that is up to "
-                    f"{(resists[stiff] / energy[stiff]).max():.1g} of the energy; expected "
-                    f"displacements of degree {geometry_degree(mesh)}, or a mesh of degree {degree}"
-                )
+            turns.append((slope - slope.T) / 2.0)
+        yield from self._resisting(u, subdomains, turns)
+        angles = [float(np.linalg.norm(turn)) / 2.0**0.5 for turn in turns]
         worst = subdomains.of_bodies([angles], largest=True)[0]
         turned = worst > LIMITS.turns
         if np.any(turned):
@@ -226,6 +215,25 @@ class Diagnostics:
                 f"{self._names(turned)}: parts turn by up to {worst.max():.2g} radians; "
                 "linear kinematics takes half the square of that for strain: expected smaller "
                 "loads, or a nonlinear model"
+            )
+
+    def _resisting(self, u: Array, subdomains: Subdomains, turns: Sequence[Array]) -> Iterator[str]:
+        """Bodies whose curved cells resist mean turns of subdomains, shapes ``(gdim, gdim)``."""
+        mesh, degree = self._decomposition.mesh, self._dofs.V.element.basix_element.degree
+        if geometry_degree(mesh) <= degree or self._dofs.axisymmetric:
+            return
+        turned, points = np.zeros_like(u), self._points(subdomains)
+        for (_, part), x, turn in zip(subdomains.elastic_parts, points, turns, strict=True):
+            turned[part] = (x @ turn).ravel()
+        each = [subdomains.energies(subdomains.with_rigid(of)) for of in (u, turned)]
+        energy, resists = subdomains.of_bodies(each)
+        stiff = resists > LIMITS.resists * energy
+        if np.any(stiff):
+            yield (
+                f"{self._names(stiff)}: cells are curved and displacements have degree "
+                f"{degree}, in which curved cells cannot turn without strain: that is up to "
+                f"{(resists[stiff] / energy[stiff]).max():.1g} of the energy; expected "
+                f"displacements of degree {geometry_degree(mesh)}, or a mesh of degree {degree}"
             )
 
     def _facets(self, solution: Solution, subdomains: Subdomains) -> Iterator[str]:

@@ -255,7 +255,8 @@ class Obstacle(ContactPartner):
 
         At the first search the shape has to fit: later the surface may have turned away from it.
         """
-        if stiffness is not None and dofs.bs > 1:  # of a scalar space the first component counts
+        # of a scalar space the gradient's first component counts
+        if stiffness is not None and dofs.bs > 1:
             self._check_shape(dofs)
         return super().settled(dofs, contact, reach, stiffness, flag)
 

@@ -159,7 +159,7 @@ class Recycled(DirectionStore):
 
 
 def right_singular(comm: MPI.Intracomm, A: Array) -> tuple[Array, Array]:
-    """Singular values and right singular vectors of A, its rows spread over ranks. Collective.
+    """Return singular values and right singular vectors of A, spread over ranks. Collective.
 
     LAPACK's gesdd gives up on some graded triangles; its gesvd, which is slower, does not.
     """
