@@ -114,6 +114,21 @@ def test_a_small_displacement_is_that_of_linear_elasticity(name):
     assert np.abs(K - expected).max() < 1e-13
 
 
+@pytest.mark.parametrize("name", LAWS)
+def test_selective_integration_has_the_forces_of_a_homogeneous_strain(name):
+    kind, given = LAWS[name]
+    mesh, found = dmesh.create_unit_cube(MPI.COMM_SELF, 2, 2, 2, dmesh.CellType.hexahedron), []
+    elastic = tfeti.Elasticity(mesh, E=E, nu=NU)
+    for selective in (False, True):
+        u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (3,))))
+        u.interpolate(lambda x: (0.05 * x[0] + 0.04 * x[1], -0.02 * x[1], -0.01 * x[2]))
+        law = kind(elastic, u, selective=selective, **given)
+        law.update()
+        F = law.residual(ufl.TestFunction(u.function_space))
+        found.append(fem.assemble_vector(fem.form(F)).array)
+    assert np.abs(found[1] - found[0]).max() < 1e-9 * np.abs(found[0]).max()
+
+
 def test_neo_hooke_is_that_of_the_reference():
     for model in ("plane_strain", "3d"):
         u = body(model)
