@@ -118,7 +118,10 @@ def test_what_is_wrong_with_stiffness_or_load_is_named(change, load, message):
 @pytest.mark.parametrize(
     ("share", "message"),
     [
-        (1e-3, "the stiffness is not positive semidefinite; expected a linear"),
+        (
+            1e-3,
+            "the stiffness is not positive semidefinite; expected a linear elastic form, or of a n",
+        ),
         (0.0, "the form gives no energy to motions besides the 6 of a rigid body"),
     ],
 )

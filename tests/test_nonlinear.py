@@ -350,6 +350,7 @@ def small(comm):
     [
         ({"F": "square"}, "F is not a linear form"),
         ({"F": "energy", "J": None}, "F has no test function; expected a linear form, such as"),
+        ({"F": "dead"}, "F does not depend on u"),
         ({"J": "skew"}, "not symmetric .* or the tangent of an energy"),
         ({"finite": True}, "no J"),
         ({"finite": True, "J": None}, "takes a rotation for a stretch"),
@@ -363,6 +364,7 @@ def test_mistakes_are_named(change, said, comm):
     du = ufl.TrialFunction(u.function_space)
     forms = {"F": elastic.a(u, v), "J": elastic.a(du, v)}
     meant = {"square": ufl.inner(v, v) * ufl.inner(u, v) * ufl.dx, "energy": u[0] ** 2 * ufl.dx}
+    meant["dead"] = elastic.a(fem.Function(u.function_space), v)
     meant["skew"] = forms["J"] + 0.1 * du[0].dx(1) * v[1] * ufl.dx
     change = {k: meant[to] if isinstance(to, str) else to for k, to in change.items()}
     given = {**forms, "u": u, **change}
@@ -372,11 +374,12 @@ def test_mistakes_are_named(change, said, comm):
 
 
 def test_what_a_nonlinear_problem_does_not_take_is_named(comm):
-    problem, _, _ = plastic(comm)
+    problem, law, _ = plastic(comm)
     with pytest.raises(tfeti.InputError, match="load and stiffness are those of linear problems"):
         problem.update(load=ufl.ZeroBaseForm((ufl.TestFunction(problem.u.function_space),)))
     for said, given in {
         "rtol auto: it is for linear problems": {"petsc_options": {"rtol": "auto"}},
+        "a J2Plasticity of another displacement": {"update": law.update, "state": law.state},
         "J2Plasticity, whose internal variables plastic_s": {"state": {}},
         "state is that of a J2Plasticity, .* expected upd": {"update": None},
     }.items():

@@ -214,7 +214,7 @@ class Diagnostics:
             yield (
                 f"{self._names(turned)}: parts turn by up to {worst.max():.2g} radians; "
                 "linear kinematics takes half the square of that for strain: expected smaller "
-                "loads, or a nonlinear model"
+                "loads, or finite strain"
             )
 
     def _resisting(self, u: Array, subdomains: Subdomains, turns: Sequence[Array]) -> Iterator[str]:

@@ -116,6 +116,8 @@ class NonlinearContactProblem(ContactProblem):
                 raise InputError(f"F has no test function; expected {expected}")
             if update is not None:
                 checked_callable(update, "update", "a function without arguments")
+            elif u not in F.coefficients():
+                raise InputError("F does not depend on u; expected a residual of it, or update=")
             if finite and J is not None:
                 raise InputError("finite=True: expected no J, since the tangent is made from F")
             for contact in checked_contacts(contacts) if finite else ():
@@ -129,7 +131,7 @@ class NonlinearContactProblem(ContactProblem):
             elif J is None:
                 J = ufl.derivative(F, u)
             checked_type(J, ufl.Form, "J", "a bilinear form")
-            check_state(update, state)
+            check_state(update, state, u)
             given["state"] = list(state) if isinstance(state, Mapping) else []
             tolerances = NewtonTolerances() if tolerances is None else tolerances
             checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")

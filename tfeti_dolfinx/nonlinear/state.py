@@ -101,8 +101,8 @@ class InternalVariables:
             function.x.array[:] = new
 
 
-def check_state(update: Any, state: Any) -> None:
-    """Raise if of a material either ``update`` or ``state`` is given, and not the other."""
+def check_state(update: Any, state: Any, u: fem.Function) -> None:
+    """Raise if of a material ``update`` or ``state`` is missing, or it is one of another ``u``."""
     if update is None and isinstance(state, LawVariables):
         name = type(state.law).__name__
         raise InputError(
@@ -110,6 +110,11 @@ def check_state(update: Any, state: Any) -> None:
             "surface; expected update=, its method"
         )
     law = getattr(update, "__self__", None)
+    if isinstance(of := getattr(law, "u", None), fem.Function) and of is not u:
+        raise InputError(
+            f"update is a method of a {type(law).__name__} of another displacement; expected one "
+            "that was made with u"
+        )
     variables = getattr(law, "state", None)
     if not isinstance(variables, Mapping):
         return

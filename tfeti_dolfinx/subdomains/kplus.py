@@ -139,7 +139,10 @@ def why_indefinite(
     try:
         factor = regularised(shifted, R, fixing_dofs, prefix)
     except NotPositiveDefiniteError:
-        return "the stiffness is not positive semidefinite; expected a linear elastic form"
+        return (
+            "the stiffness is not positive semidefinite; expected a linear elastic form, or of a "
+            "nonlinear one a tangent of a material that does not soften"
+        )
     if gives_no_energy(K, np.hstack((R, outside)), x, factor):
         return (
             f"the form gives no energy to motions besides the {R.shape[1]} of a rigid body that it "
