@@ -10,6 +10,7 @@ from scenes import accepted, clamp, decomposed, integral, largest, measures, sol
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import SimplePlasticity, neo_hooke
+from tfeti_dolfinx.nonlinear.newton import Anderson
 from tfeti_dolfinx.nonlinear.state import InternalVariables
 
 E, NU = 1.0, 0.3
@@ -277,6 +278,17 @@ def test_a_free_body_slides_on_both_sides(comm):
         accepted(problem)
         for Q, N in (problem.solution.contact(i).resultant.force for i in range(2)):
             assert abs(Q - sign * mu * N) < 1e-4 * abs(N)
+
+
+@pytest.mark.parametrize(("most", "kept"), [(0, [0, 0, 0]), (2, [1, 2, 2])])
+def test_acceleration_has_as_many_iterates_as_it_is_given(most, kept, comm):
+    faster, found = Anderson(tfeti.NewtonTolerances(anderson=most), comm), []
+    for k in range(3):
+        u, d = np.full(2, float(k)), np.array((1.0, 0.5**k))
+        end = faster.next(u, d)
+        assert most or np.array_equal(end, u + d)
+        found.append(len(faster.past))
+    assert found == kept
 
 
 def two_blocks(degree, **where):

@@ -52,7 +52,7 @@ class NewtonTolerances:
         turning: Where the first increment with new places is more than this share of that with the
             last ones, contact changes more by where bodies are than by their stresses: from then on
             places are new for each linearised problem.
-        anderson: Iterates that Anderson's acceleration combines.
+        anderson: Earlier iterates that Anderson's acceleration combines; 0: none, it is off.
         dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
             are taken for 0.
         slow: A kept model is made anew where an increment is more than this share of the last one.
@@ -147,5 +147,6 @@ class Anderson:
             rcond = self.tolerances.dependent
             share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=rcond)[0]
             moved = end - (u[:, None] - places + steps) @ share
-        self.past = [*self.past, (u, d)][-self.tolerances.anderson :]
+        most = self.tolerances.anderson
+        self.past = [*self.past, (u, d)][-most:] if most else []
         return moved
