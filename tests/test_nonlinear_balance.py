@@ -78,6 +78,25 @@ def test_forces_balance_and_friction_only_dissipates(scene, comm):
     assert np.linalg.norm(support) < 1e-12
 
 
+@pytest.mark.parametrize("n", [(3, 4), (4, 3)])
+def test_a_block_that_only_friction_held_is_let_go_at_once(n, comm):
+    """Pressed, sheared, and the plate back to where it was: no strain, near where it was."""
+    d = stacked("quadrilateral", *n, 3, upper=(0.2, 0.8))
+    way = fem.Constant(d.mesh, (0.0, 0.0))
+    plate = tfeti.RigidBody(tfeti.Plane((0.0, 1.0), (0.0, -1.0)), displacement=way)
+    rough = {"friction": tfeti.Coulomb(0.5)}
+    contacts = tfeti.Contact(*PAIR, **rough), tfeti.Obstacle("upper top", plate, **rough)
+    problem = hyperelastic(d, clamped(d, "lower bottom"), *contacts, rtol=1e-6)
+    u, x = problem.u, ufl.SpatialCoordinate(d.mesh)
+    upper, places = ufl.conditional(ufl.gt(x[1], 0.0), 1.0, 0.0), []
+    for way.value[:] in ((0.0, -0.1), (0.1, -0.1), (0.0, 0.0)):
+        accepted(problem)
+        places.append(integral(upper * u[0] * ufl.dx))
+    assert integral(ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(u)) * ufl.dx) < 1e-16
+    assert places[1] > 0.01
+    assert abs(places[2] - places[1]) < 0.02 * places[1]
+
+
 def test_moments_balance_about_where_bodies_are(comm):
     """A block drawn over a plane and turned: forces act at X + u."""
     parts = [("upper", (0.0, 0.0), (2.0, 1.0), (6, 3))]

@@ -49,7 +49,7 @@ from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude
 from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod
+from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod, Subdomains
 from tfeti_dolfinx.system import Settings, System
 
 log = logging.getLogger(__name__)
@@ -278,6 +278,7 @@ class ContactProblem:
         options = replace(system.options, rtol=now.rtol, atol=now.atol, warnings=now.warnings)
         dual.forget_counts()
         dual.begin = system.begun()
+        dual.negligible = self._negligible(dual.subdomains)
         # 1. the multipliers
         with stage("solve", seconds):
             start = None
@@ -564,6 +565,10 @@ class ContactProblem:
     def _given_besides(self) -> dict[str, Any]:
         """Return other input, checked, that ranks must have alike."""
         return {}
+
+    def _negligible(self, subdomains: Subdomains) -> Array | float:
+        """Return displacements of bodies that count as none: without a load step before, 0."""
+        return 0.0
 
     def _set_out(self) -> None:
         """Set the prediction of a step; nothing without inertia."""

@@ -112,6 +112,7 @@ class Dual:
         last: The last solution of block Newton, or without a kernel, with its image.
         recycled: Directions of earlier solves; None: none are kept.
         begin: Where the load step began, shape ``(n,)``; bodies that nothing holds stay near.
+        negligible: Displacements of bodies that count as none, shape ``(bodies,)``.
     """
 
     def __init__(
@@ -180,6 +181,7 @@ class Dual:
         self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
         self.begin: Array | float = 0.0
+        self.negligible: Array | float = 0.0
         self.recycled: Recycled | None = None
         self._learns = recycle == "auto"
         if isinstance(recycle, int) and recycle:

@@ -91,11 +91,12 @@ def recover(
         borne |= light
 
 
-def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float) -> Recovered:
+def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float, unseen: float) -> Recovered:
     """Return an iterate with its bodies as near to another displacement as rows let. Collective.
 
     Motions that no row with a force resists are the solver's only by chance: of these places the
-    nearest to ``begin`` is taken, in the mean square over each body, that overlaps nowhere.
+    nearest to ``begin`` is taken, in the mean square over each body, that overlaps nowhere. Rows
+    do not see motions that they resist by less than the share ``unseen`` of others.
     """
     comm, N = coarse.comm, _basis(coarse, state)
     wanted = N.T @ coarse.bodies.part_of(begin - state.u)
@@ -104,15 +105,21 @@ def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float) -> Recov
         rows_of(coarse.J.csr() @ N, rows).csr(),
         np.maximum(state.gap[rows], 0.0) / coarse.row_size[rows],
     )
-    ranks, motion = comm.gather(own, root=0), None
+    ranks, motion, closed = comm.gather(own, root=0), None, None
     with raised_on_all_ranks(comm):
         if ranks is not None:
             closing, gaps = zip(*ranks, strict=True)
             C, g, motion = csr_array(vstack(closing)), np.concatenate(gaps), np.array(wanted)
+            by = np.zeros(len(g))
             for part, at, dense in parts_of_columns(C):
-                motion[part] = least_distance(dense, g[at], wanted[part])
+                U, sigma, V = np.linalg.svd(dense, full_matrices=False)
+                seen = U * np.where(sigma > unseen * sigma.max(initial=0.0), sigma, 0.0) @ V
+                motion[part] = least_distance(seen, g[at], wanted[part])
+                by[at] = seen @ motion[part]
+            closed = np.split(by, np.cumsum([len(gap) for gap in gaps])[:-1])
     alpha = coarse.motions @ np.asarray(N @ bcast_from_root(comm, motion))
     u, gap = state.u + coarse.kernel_motion(alpha), state.gap - coarse.Gt @ alpha
+    gap[rows] = state.gap[rows] - coarse.row_size[rows] * comm.scatter(closed, root=0)
     return replace(state, u=u, gap=gap)
 
 

@@ -39,6 +39,10 @@ class StoppingTolerances:
     # of the other error, or of a 1e-5th of ‖u‖_K where that is more: the bound of the algebraic
     # error
     target: float = 0.1
+    # motions of loose bodies that rows resist by less than this share they do not see, nor by less
+    # than that of rtol: overlaps that this leaves are small beside the motion
+    unseen: float = 3e-7
+    share_unseen: float = 0.1
     aim: float = 0.5  # of the tolerance: residuals are aimed a little below what was asked for
     # a tolerance never falls by more at once, since the size of the displacement may have been
     # learnt from a poor iterate
@@ -299,7 +303,8 @@ class Accuracy(StoppingRule):
         assert self.recovered is not None
         change, before, looks = self.measures.change, self._before, self.looks
         del self.reached[looks - 1 :]
-        self._measure(placed(self._dual.coarse, self.recovered, self._dual.begin), face)
+        unseen = min(self._limits.share_unseen * self.rtol, self._limits.unseen)
+        self._measure(placed(self._dual.coarse, self.recovered, self._dual.begin, unseen), face)
         self.measures = replace(self.measures, change=change)
         self._before, self.looks = before, looks
 
@@ -347,6 +352,7 @@ class Accuracy(StoppingRule):
         energy = np.sqrt(np.maximum(now.energies, 0.0))
         # where all is rounding, energy does not say how far anything moves
         noise = self._limits.noise * now.size.max(initial=0.0) + self._at_rest()
+        noise = np.maximum(noise, self._dual.negligible)
         known = (energy > 0.0) & (now.size > noise)
         shown = np.divide(now.elastic, energy, out=np.zeros_like(energy), where=known)
         estimate = shown * np.sqrt(now.correction_energies)
@@ -364,6 +370,7 @@ class Accuracy(StoppingRule):
         most = max(most, now.begin)
         all_rest = at_rest.min() if len(at_rest) else 0.0  # then forces are rounding, too
         noise = given.noise * most + given.load_noise * now.alone + all_rest
+        noise = np.maximum(noise, self._dual.negligible)
         displacement = self.rtol * share * now.size + noise
         largest = float(displacement.max(initial=0.0))
         displacement = np.maximum(displacement, at_rest)

@@ -36,6 +36,8 @@ class NewtonTolerances:
         last: It is solved to this factor of ``rtol``, which leaves little to the last one.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
+        negligible: Of ``rtol`` and of a body's displacement there: less is no part of the answer,
+            as in bodies that are unloaded.
         nowhere: Of the length of the model, in finite strain: less is rounding of where bodies are.
         curvature: A step is shortened where the residual along it, contact forces included, has
             at its end more than this share of its value at its begin, with the other sign; None:
@@ -73,6 +75,7 @@ class NewtonTolerances:
     near: float = 20.0
     last: float = 2.0
     nothing: float = 1e-12
+    negligible: float = 1e-3
     nowhere: float = 1e-13
     curvature: float | None = None
     max_line_search: int = 12

@@ -30,6 +30,7 @@ from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue, check_sta
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
 from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.system import System
 
 
@@ -229,9 +230,12 @@ class NonlinearContactProblem(ContactProblem):
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
                 self._last_increment = min(increment, self._loosest)
-            if t < 1.0:
-                faster.past.clear()  # a model that does not hold along d tells nothing of the next
-            plain = t < 1.0 or step == 0 or not (self._finite or forms.kept)
+            # a model that does not hold along d tells nothing of the next, nor do places of bodies
+            # that anything might have
+            plain = t < 1.0 or bool(np.any(self._let_go))
+            if plain:
+                faster.past.clear()
+            plain |= step == 0 or not (self._finite or forms.kept)
             if not plain:  # else the line search has ended there
                 self._set(faster.next(u, d))
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
@@ -254,7 +258,8 @@ class NonlinearContactProblem(ContactProblem):
         moved, size = subdomains.body_sizes(
             [subdomains.with_rigid(self.dofs.to_primal(x)) for x in (d, end)]
         )
-        moved -= max(self._tolerances.nothing * most, self._last_digit)
+        rounding = max(self._tolerances.nothing * most, self._last_digit)
+        moved -= np.maximum(self._negligible(subdomains), rounding)
         return np.where(size > self._least, np.maximum(moved, 0.0) / np.maximum(size, TINY), 0.0)
 
     def _conforming(self, u: Array, end: Array) -> Array:
@@ -500,6 +505,11 @@ class NonlinearContactProblem(ContactProblem):
         self._set(self._begin)
         if self._places is not None:
             self._go_to_places(self._places)
+
+    def _negligible(self, subdomains: Subdomains) -> Array:
+        begin = subdomains.with_rigid(self.dofs.to_primal(self._begin))
+        share = self._tolerances.negligible * self._exact
+        return np.asarray(share * subdomains.body_sizes([begin])[0])
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
         solution = super()._make_solution(u, multipliers, gluing)

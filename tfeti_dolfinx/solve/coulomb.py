@@ -119,7 +119,7 @@ def solve_with_friction(
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         reached = parameters.looser * rule.tolerance
         if result.reason <= 0:
-            if law is None and not bounds.turn(result.reason):
+            if law is None and not bounds.turn(result):
                 break
             looked = aim == np.inf and result.reason == ConvergedReason.DIVERGED_ITS
             law = law and newton.go_on(law, bounds, reached, looked)
@@ -198,7 +198,7 @@ class FrictionBounds:
         at = constraints.pressed
         self._rows = constraints.pressed_by[at]
         self._mu = np.linalg.norm(constraints.coefficients[at], axis=1)
-        self._slipped = False
+        self._slipped = self._wedged = False
         stuck = [] if start is None else [np.inf]
         self._others = [*stuck, *parameters.shares]
         self.now: Array = np.full(len(self._rows), np.inf)
@@ -246,17 +246,23 @@ class FrictionBounds:
         np.maximum.at(weights, coarse.J.row, loads[coarse.J.body])
         return np.asarray((weights / coarse.row_size)[self._rows])
 
-    def turn(self, reason: ConvergedReason) -> bool:
-        """Let all slip, once, where sticking contradicts itself, as beside a wall that pushes.
+    def turn(self, result: QPResult) -> bool:
+        """Take other bounds after a problem without an answer; return whether there are any.
 
-        Or where bounds of forces that are gone leave a body that is let go to rounding. Return
-        whether there are other bounds.
+        Where sticking contradicts itself, as beside a wall that pushes, or bounds of forces that
+        are gone leave a body that is let go to rounding, all slip. Where that is lost, too, as in a
+        gap that is hardly a wedge, bounds are those of the forces found then. Each is tried once.
         """
-        contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
+        reason, slips = result.reason, not any_rank(self._comm, self.now > 0.0)
         lost = reason in (ConvergedReason.DIVERGED_STALLED, ConvergedReason.DIVERGED_ROUNDING)
-        if not (lost or contradicts) or self._slipped:
+        contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
+        found = self.forces_of(result.lam)
+        if (lost or contradicts) and not self._slipped and not slips:
+            self.now, self._slipped = np.zeros(len(self._rows)), True
+        elif lost and not self._wedged and any_rank(self._comm, found > 0.0):
+            self.now, self._slipped, self._wedged = found, True, True
+        else:
             return False
-        self.now, self._slipped = np.zeros(len(self._rows)), True
         return True
 
     def change(self, values: Array) -> float:
@@ -267,7 +273,9 @@ class FrictionBounds:
         """
         parameters = self._parameters
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
-        self._none = parameters.no_force * max(norm_over(self._comm, values), driving)
+        most = max(norm_over(self._comm, values), driving)
+        moves_none = float(np.min(self._dual.negligible)) / (self._dual.seen or np.inf)
+        self._none = max(parameters.no_force * most, moves_none)
         self._found = self.forces_of(values)
         self._solved = [*self._solved[-1:], (self.now, self._found)]
         if self.stick:
