@@ -60,6 +60,7 @@ class NewtonParameters:
     # what a solve on a face that stays reduces its residual to, before step 1 looks at it
     stage: float = 0.1
     patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
+    circle: int = 300  # steps in a row that do not halve ‖g^P‖: q falls by what Gλ = e lacks
     # of the gradient: multipliers of Gλ = e that make it longer than that are rounding of motions
     # that a face does not see
     unfelt: float = 1e6
@@ -203,7 +204,8 @@ class NewtonIteration:
         residual: ‖g^P‖, g^P = (λ − λ̂)/ᾱ.
         norm: Estimate of ‖F‖; ᾱ is its inverse. rounding: What that may make of ‖g^P‖ alone.
         least: The last ‖g^P‖ that was half of the one before.
-        idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
+        idle: So many looks in a row have found neither q nor ‖g^P‖ lower; since: not half of
+            ``least``.
         unbalanced: Whether the last end of step 3 was outside of Ω or did not fulfil Gλ = e.
         resume: Whether λ is where PCPG has stopped.
     """
@@ -216,7 +218,7 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
         self.pressed = qp.feasible.face(z.lam, z.g)
         self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.resume, self.unbalanced = 0, False, False
+        self.idle, self.since, self.resume, self.unbalanced = 0, 0, False, False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
@@ -236,9 +238,9 @@ class NewtonIteration:
         square, size = qp.dot((moved, moved), (self.z.lam, self.z.lam))
         self.residual = self.norm * np.sqrt(square)
         self.rounding = self.parameters.lost * self.norm * np.sqrt(size)
-        self.idle += 1
+        self.idle, self.since = self.idle + 1, self.since + 1
         if self.residual <= 0.5 * self.least:
-            self.least, self.idle = self.residual, 0
+            self.least, self.idle, self.since = self.residual, 0, 0
 
     def examine(self, rule: StoppingRule) -> ConvergedReason:
         """Apply the stopping rule where ‖g^P‖ is small enough."""
@@ -322,7 +324,8 @@ class NewtonIteration:
         """Move to a point where q is lower by ``gain``."""
         z = self.z
         work, load = self.qp.dot((z.lam, z.g), (z.lam, self.qp.d))
-        if gain > self.parameters.hidden * (abs(work) + abs(load)):
+        given, terms = self.parameters, abs(work) + abs(load)
+        if gain > given.hidden * terms and self.since < given.circle:
             self.idle = 0
         self.z = to
 
