@@ -230,8 +230,8 @@ class NonlinearContactProblem(ContactProblem):
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
                 self._last_increment = min(increment, self._loosest)
-            # a model that does not hold along d tells nothing of the next, nor do places of bodies
-            # that anything might have
+            # a model that does not hold along d tells nothing of the next, nor does a place that is
+            # one of many
             plain = t < 1.0 or bool(np.any(self._let_go))
             if plain:
                 faster.past.clear()

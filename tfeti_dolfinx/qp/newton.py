@@ -204,8 +204,8 @@ class NewtonIteration:
         residual: ‖g^P‖, g^P = (λ − λ̂)/ᾱ.
         norm: Estimate of ‖F‖; ᾱ is its inverse. rounding: What that may make of ‖g^P‖ alone.
         least: The last ‖g^P‖ that was half of the one before.
-        idle: So many looks in a row have found neither q nor ‖g^P‖ lower; since: not half of
-            ``least``.
+        idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
+        since: So many have not found ‖g^P‖ half of ``least``.
         unbalanced: Whether the last end of step 3 was outside of Ω or did not fulfil Gλ = e.
         resume: Whether λ is where PCPG has stopped.
     """
