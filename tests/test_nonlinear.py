@@ -385,6 +385,20 @@ def test_mistakes_are_named(change, said, comm):
         tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given).solve()
 
 
+def test_what_updates_may_have_a_function_of_its_own_named_u(comm):
+    decomposition, u, v, elastic, _, bc = small(comm)
+
+    class Heated:
+        def __init__(self):
+            self.u = fem.Function(u.function_space)
+
+        def update(self):
+            self.u.x.array[:] = 0.0
+
+    F, given = elastic.a(u, v), {"update": Heated().update}
+    solved(tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given))
+
+
 def test_what_a_nonlinear_problem_does_not_take_is_named(comm):
     problem, law, _ = plastic(comm)
     with pytest.raises(tfeti.InputError, match="load and stiffness are those of linear problems"):

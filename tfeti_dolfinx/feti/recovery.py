@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from mpi4py import MPI
 from scipy.optimize import lsq_linear
 from scipy.sparse import csr_array, vstack
 
@@ -12,6 +13,7 @@ from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.rigid_bodies import Motions, orthonormal_columns, parts_of_columns
+from tfeti_dolfinx.qp.recycling import right_singular
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -112,8 +114,9 @@ def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float, unseen: 
             C, g, motion = csr_array(vstack(closing)), np.concatenate(gaps), np.array(wanted)
             by = np.zeros(len(g))
             for part, at, dense in parts_of_columns(C):
-                U, sigma, V = np.linalg.svd(dense, full_matrices=False)
-                seen = U * np.where(sigma > unseen * sigma.max(initial=0.0), sigma, 0.0) @ V
+                sigma, V = right_singular(MPI.COMM_SELF, dense)
+                V = V[sigma > unseen * sigma.max(initial=0.0)]
+                seen = dense @ V.T @ V
                 motion[part] = least_distance(seen, g[at], wanted[part])
                 by[at] = seen @ motion[part]
             closed = np.split(by, np.cumsum([len(gap) for gap in gaps])[:-1])

@@ -13,6 +13,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.common.validation import checked_type, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.forms.elasticity import Elasticity
 
 NewValue = Any  # a UFL expression, or a callable that returns an array of the function's size
 
@@ -110,7 +111,8 @@ def check_state(update: Any, state: Any, u: fem.Function) -> None:
             "surface; expected update=, its method"
         )
     law = getattr(update, "__self__", None)
-    if isinstance(of := getattr(law, "u", None), fem.Function) and of is not u:
+    made = isinstance(getattr(law, "elasticity", None), Elasticity)  # as ready laws are
+    if made and getattr(law, "u", u) is not u:
         raise InputError(
             f"update is a method of a {type(law).__name__} of another displacement; expected one "
             "that was made with u"
