@@ -10,6 +10,7 @@ from scenes import accepted, integral, largest, roller, solved, unknowns
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
+from meshes.rings import rings as shrunk
 
 E, NU = 1.0, 0.3
 DX = {"metadata": {"quadrature_degree": 4}}
@@ -127,6 +128,18 @@ def rings(comm, n):
     angle, radius = mesh.geometry.x[:, 0].copy(), mesh.geometry.x[:, 1].copy()
     mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = radius * np.cos(angle), radius * np.sin(angle)
     return tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
+
+
+def test_a_ring_that_spins_on_another_is_named(comm):
+    d = shrunk(comm, (16, 20), overlap=0.01)
+    V, u, v, _ = unknowns(d)
+    F = ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, v)
+    given = clamped(d, "bore")(V), [tfeti.Contact("shaft", "hub")], d
+    few = tfeti.NewtonTolerances(max_it=8)
+    problem = tfeti.NonlinearContactProblem(F, u, *given, finite=True, tolerances=few)
+    spins = r"'outer'\) is free to move \(rotation in the plane\), or contact hardly resists that"
+    with pytest.raises(tfeti.ConvergenceError, match=spins):
+        problem.solve()
 
 
 def unbalanced(problem):

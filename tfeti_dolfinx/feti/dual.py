@@ -401,6 +401,20 @@ class Dual:
         most = np.flatnonzero(slip > 0.5 * largest(coarse.comm, slip))
         return free_to_move(coarse.bodies.amounts(motion), *self._names), most
 
+    def moves_rigidly(self, u: Array, bends: float) -> str:
+        """Return a sentence on the bodies that move most, but for less than a share bends, or "".
+
+        Collective; u on all unknowns.
+        """
+        subdomains, bodies = self.subdomains, self.coarse.bodies
+        amounts = bodies.amounts(bodies.part_of(u))
+        sizes = subdomains.body_sizes([u, u - subdomains.modes_motion(amounts)])
+        moved, bent = bcast_from_root(subdomains.comm, sizes)
+        rigid = (bent <= bends * moved) & (moved >= 0.5 * moved.max(initial=0.0))
+        if not np.any(rigid):
+            return ""
+        return free_to_move(np.where(rigid[:, None], amounts, 0.0), *self._names)
+
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
         last = None if self._on_last is None else self._on_last[1]

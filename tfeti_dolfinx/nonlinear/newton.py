@@ -61,6 +61,7 @@ class NewtonTolerances:
         difference: Length of the step, of the displacement, of the difference quotient that a
             given J is compared with where Newton's method has failed.
         another: Of J along a step: a difference beyond it is that of another tangent.
+        bends: Of a body's step: less strain makes the step a rigid motion, which is named then.
         turned: Angle by which a body is turned to see whether F is one of finite strain.
         alike: Of the residual of a stretch: residuals nearer to each other are the same.
     """
@@ -89,6 +90,7 @@ class NewtonTolerances:
     slow: float = 0.7
     difference: float = 1e-6
     another: float = 0.3
+    bends: float = 0.1
     turned: float = 0.1
     alike: float = 1e-6
 

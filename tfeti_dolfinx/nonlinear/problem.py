@@ -298,6 +298,12 @@ class NonlinearContactProblem(ContactProblem):
                 "a tangent J that is the derivative of F, as J2Plasticity.tangent(w, v) is that of "
                 f"its residual; along the last step they differ by {off / size:.1e} of J"
             )
+        moved = self._system.subdomains.with_rigid(self.dofs.to_primal(d))
+        if words := self._system.dual.moves_rigidly(moved, tol.bends):
+            return (
+                f"{words}, or contact hardly resists that; add a Dirichlet condition, a spring or "
+                "friction, or take smaller load steps"
+            )
         return "smaller load steps"
 
     def _check_rotations(self) -> None:
