@@ -7,10 +7,13 @@ import ufl
 from bodies import clamped, drawn, joined, no_load, torn_boxes, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
+from mpi4py import MPI
 from scenes import bumpy, decomposed, exterior, problem, solved
 from true_errors import ring_problem
 
 import tfeti_dolfinx as tfeti
+from meshes.rings import lame_pressure
+from meshes.rings import rings as shrunk
 
 
 def ring(centre, inner, outer, layers, around, jitter, seed):
@@ -101,6 +104,19 @@ def test_a_ring_that_has_borne_no_force_sticks_before_it_slips():
         p.update(gap={"fit": -1e-3})
         p.solve()
         assert p.report.F_multiplications <= 25
+
+
+@pytest.mark.parametrize(("cells", "degree"), [((16, 20), 2), ((17, 33), 2), ((40, 30), 1)])
+def test_a_fit_that_nothing_holds_in_space_is_right_with_friction(cells, degree):
+    """Sides of friction are apart by curved facets; that does not hold both rings as one."""
+    d = shrunk(MPI.COMM_WORLD, cells, degree)
+    fit = tfeti.Contact("shaft", "hub", gap=-0.01, friction=tfeti.Coulomb(0.5))
+    p = solved(two_body_problem(d, no_load, lambda V: [], [fit], degree, rtol=1e-8))
+    contact = p.solution.contact(0)
+    pressure = d.comm.allreduce(contact.force.sum()) / d.comm.allreduce(contact.area.sum())
+    assert pressure == pytest.approx(lame_pressure(0.01), rel=0.03)
+    assert p.report.F_multiplications <= 50
+    assert p.report.free_modes == 3
 
 
 def test_fits_are_released_beside_one_that_stays():

@@ -130,6 +130,21 @@ def rings(comm, n):
     return tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
 
 
+def test_a_fit_that_nothing_holds_in_space_is_solved_with_friction(comm):
+    """Rings shrunk on each other do not turn as one, since contact does not hold that."""
+    d = shrunk(comm, (24, 30), 2, overlap=0.05)
+    V, u, v, _ = unknowns(d, 2)
+    F = ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, v)
+    rough = tfeti.Contact("shaft", "hub", friction=tfeti.Coulomb(0.2))
+    problem = tfeti.NonlinearContactProblem(F, u, [], [rough], d, finite=True)
+    for steps in (10, 5):
+        accepted(problem)
+        assert problem.report.newton_steps <= steps
+    x = V.tabulate_dof_coordinates()
+    turns = x[:, 0] * u.x.array[1::2] - x[:, 1] * u.x.array[::2]
+    assert largest(turns) < 0.01 * largest(u.x.array)
+
+
 def test_a_ring_that_spins_on_another_is_named(comm):
     d = shrunk(comm, (16, 20), overlap=0.01)
     V, u, v, _ = unknowns(d)

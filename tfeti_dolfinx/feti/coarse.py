@@ -100,7 +100,12 @@ class CoarseSpace(Coarse):
         glues[springs] = False
         if subdomains.num_springs:
             self._unglued = self.unresisted(glues, self.bodies.unsprung)
+        # contact does not hold bodies that move as one; nor do its rows then in G
+        J = self.J
+        if self.bodies.count > 1 and self.unheld.free.any() and any_rank(comm, len(rubbing) > 0):
+            self.J = J.without(self.bodies.as_one())
         self.free_motions = self.unresisted(~equalities)
+        self.J = J.without(self.free_motions.joint)
         both = self.free_motions.columns
         # made on one rank: processors that round differently might choose differently
         self._basis = bcast_from_root(

@@ -38,6 +38,9 @@ class MotionTolerances:
     # size of a row on motions of bodies, over its own, below which it only glues
     gluing: float = 1e-6
     no_grip: float = 1e-12  # the same of an entry of another row that is only rounding
+    # of a row, what it sees of bodies that turn as one: friction acts on sides that are apart by so
+    # little of the bodies' size, by rounding, curved facets or what a step of Newton's is off
+    as_one: float = 1e-3
     # of the largest coefficient of a motion: a body that moves by less takes no part
     takes_part: float = 1e-3
     # a motion is named after modes of this share or more, which leaves out what a rotation about
@@ -137,6 +140,26 @@ class BodyRows:
     def transposed(self, x: Array) -> Array:
         """Return the product of the transpose with a vector of the rows, shape ``(n k,)``."""
         return sum_rows(self.body, self.parts * x[self.row, None], self.shape[1]).ravel()
+
+    def without(self, motions: csr_array) -> BodyRows:
+        """Return the nearest rows that do not see motions, columns, which they hardly see."""
+        (_, n, k), parts = self.shape, self.parts.copy()
+        for _, rows, dense in parts_of_columns(motions):
+            W = np.zeros((n * k, dense.shape[1]))
+            W[rows] = dense
+            of_parts = W.reshape(n, k, -1)[self.body]
+            own = np.flatnonzero(of_parts.any(axis=(1, 2)))
+            of_parts = of_parts[own]
+            row, place = np.unique(self.row[own], return_inverse=True)
+            seen = sum_rows(place, np.einsum("pi,pic->pc", parts[own], of_parts), len(row))
+            gram = sum_rows(place, np.einsum("pic,pid->pcd", of_parts, of_parts), len(row))
+            share = np.einsum("rcd,rd->rc", np.linalg.pinv(gram, hermitian=True), seen)
+            by = np.einsum("pic,pc->pi", of_parts, share[place])
+            squares = [sum_rows(place, of**2, len(row)).sum(axis=1) for of in (by, parts[own])]
+            much, whole = np.sqrt(squares)
+            hardly = (much > TOLERANCES.no_grip) & (much <= TOLERANCES.as_one * whole)
+            parts[own] -= np.where(hardly[place, None], by, 0.0)
+        return replace(self, parts=parts)
 
     def entries(self, shown: Array, numbers: Array, width: int) -> Entries:
         """Return flagged entries of the parts, not 0, in columns with these numbers.
@@ -350,6 +373,10 @@ class Bodies:
         self.unloaded = np.maximum(noise, TOLERANCES.rounding * largest)
         others = np.maximum(noise, TOLERANCES.rounding * largest.max(initial=0.0))
         self.negligible = np.maximum(TOLERANCES.balance * largest, others)
+
+    def as_one(self) -> csr_array:
+        """Return motions of all bodies as one rigid body, as columns. Collective."""
+        return csr_array(np.transpose([self.part_of(u) for u in self._subdomains.modes_as_one().T]))
 
     def part_of(self, u: Array) -> Array:
         """Coordinates of the bodies' motion in u, by least squares over the nodes. Collective."""

@@ -27,6 +27,7 @@ from tfeti_dolfinx.subdomains.block import (
     OperatorKind,
     RigidBlock,
     SubdomainData,
+    candidate_modes,
 )
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import (
@@ -201,6 +202,13 @@ class Subdomains:
         """Cᵀ W C of each body, W the shares, shape ``(b, k, k)``. Collective."""
         found = [block.modes.T @ (block.shares[:, None] * block.modes) for block in self.blocks]
         return self._on_bodies(found, (self.num_modes, self.num_modes))
+
+    def modes_as_one(self) -> Array:
+        """Candidate modes of all bodies with nodes as one, shape ``(n, k)``."""
+        found = np.zeros((self.size, self.num_modes))
+        for block, part in self.elastic_parts:
+            found[part] = candidate_modes(block.x, block.bs, np.zeros(block.x.shape[1]), 1.0)
+        return found
 
     def moments(self, u: Array) -> Array:
         """Cᵀ W u of each body, shape ``(b, k)``, u on all unknowns. Collective."""
