@@ -288,16 +288,9 @@ def test_stresses_at_nodes_are_those_of_the_points(cell, comm):
     given.interpolate(lambda x: (0.04 * x[1], 0.0 * x[0]))
     elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
     law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=0.1)
-    problem = tfeti.NonlinearContactProblem(
-        law.residual(v),
-        u,
-        [clamp(V, decomposition.facets("side"), given)],
-        [],
-        decomposition,
-        J=law.tangent(w, v),
-        stress=law.stress,
-        petsc_options={"rtol": 1e-10},
-    )
+    bcs, F = [clamp(V, decomposition.facets("side"), given)], law.residual(v)
+    more = {"J": law.tangent(w, v), "stress": law.stress, "petsc_options": {"rtol": 1e-10}}
+    problem = tfeti.NonlinearContactProblem(F, u, bcs, [], decomposition, **more)
     problem.solve()
     mu = E / 2 / (1 + NU)
     q = np.sqrt(3.0) * mu * 0.04

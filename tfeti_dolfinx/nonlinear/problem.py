@@ -148,9 +148,9 @@ class NonlinearContactProblem(ContactProblem):
         self._forcing = forcing if tolerances.forcing is None else tolerances.forcing
         self._loosest = loosest if tolerances.loosest is None else tolerances.loosest
         self._curvature = curvature if tolerances.curvature is None else tolerances.curvature
-        updates = [law.update for law in laws]
-        own = [] if update is None or update in updates else [update]
-        self._updates = [*own, *updates]
+        self._updates = [law.update for law in laws]
+        if update is not None and update not in self._updates:
+            self._updates.insert(0, update)
         self._state = InternalVariables(state, decomposition.mesh)
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
         if self.options.rtol == "auto":
