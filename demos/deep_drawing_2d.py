@@ -128,8 +128,6 @@ def sheet_problem(bcs, contacts):
         contacts,
         decomposition,
         finite=True,
-        state=steel.state,
-        update=steel.update,
         stress=steel.stress,
         petsc_options={"tfeti_rtol": 3e-4},
     )

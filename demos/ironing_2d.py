@@ -88,7 +88,6 @@ problem = tfeti.NonlinearContactProblem(
     [tfeti.Contact("surface", "arc", friction=tfeti.Coulomb(0.3), name="die")],
     decomposition,
     finite=True,
-    update=rubber.update,
     stress=rubber.stress,
     petsc_options={"tfeti_rtol": 2e-5},
 )

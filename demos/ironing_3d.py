@@ -102,7 +102,6 @@ problem = tfeti.NonlinearContactProblem(
     [tfeti.Contact("surface", "cap", secondary="surface", friction=law, name="die")],
     decomposition,
     finite=True,
-    update=rubber.update,
     stress=rubber.stress,
     petsc_options={"tfeti_rtol": 1e-4},
 )

@@ -83,8 +83,6 @@ problem = tfeti.NonlinearContactProblem(
     [tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)), name="plane")],
     decomposition,
     J=steel.tangent(du, v),
-    state=steel.state,
-    update=steel.update,
     stress=steel.stress,
     petsc_options={"tfeti_rtol": 1e-5},
 )

@@ -100,8 +100,6 @@ problem = tfeti.NonlinearContactProblem(
     [tfeti.Obstacle("top", ball, displacement=lambda depth: (0.0, -depth), name="ball")],
     decomposition,
     J=steel.tangent(du, v),
-    state=steel.state,
-    update=steel.update,
     stress=steel.stress,
     thickness=elastic.thickness,
     petsc_options={"tfeti_rtol": 1e-4},

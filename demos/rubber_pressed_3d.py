@@ -67,7 +67,7 @@ gmsh.finalize()
 
 # ## Material
 #
-# `residual` is the derivative of the energy, and `update` keeps its tangent definite.
+# `residual` is the derivative of the energy, with a tangent that stays definite.
 
 V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (3,)))
 u, v = fem.Function(V), ufl.TestFunction(V)
@@ -88,7 +88,6 @@ problem = tfeti.NonlinearContactProblem(
     [tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)), name="plane")],
     decomposition,
     finite=True,
-    update=rubber.update,
     stress=rubber.stress,
     petsc_options={"tfeti_rtol": 1e-5},
 )

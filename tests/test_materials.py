@@ -8,6 +8,7 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import accepted, clamp, integral, unknowns
+from scipy.optimize import brentq
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
@@ -215,7 +216,8 @@ def test_a_turn_does_not_change_a_finite_law():
 
 BOTH = tfeti.J2Plasticity, tfeti.FiniteJ2Plasticity  # which take hardening in one way
 FORMS = [*((kind, form) for kind in BOTH for form in ("volumes", "constant"))]
-FORMS += [(BOTH[0], "function"), (BOTH[1], "UFL")]
+FORMS += [(BOTH[0], "function"), (BOTH[1], "UFL"), *((kind, "laws") for kind in BOTH)]
+FORMS.append((BOTH[1], "neo-Hooke"))
 
 
 @pytest.mark.parametrize(("kind", "form"), FORMS)
@@ -241,26 +243,36 @@ def test_two_steels_yield_each_by_its_own_law(kind, form, comm):
             given[name] = fem.Function(fem.functionspace(cut.mesh, ("DG", 0)))
             given[name].interpolate(lambda x, a=soft, b=hard: np.where(x[1] < 1.5, a, b))
     V, u, v, w = unknowns(cut)
-    law = kind(tfeti.Elasticity(cut, E=E, nu=NU), u, **given)
+    elastic = tfeti.Elasticity(cut, E=E, nu=NU)
+    made = [kind(elastic, u, **given)] if given["hardening"] else []
+    for name, (y, h) in {} if made else laws.items():
+        made.append(kind(elastic, u, yield_stress=y, hardening=h, volumes=name))
+    if form == "neo-Hooke":
+        made[1] = tfeti.NeoHooke(elastic, u, volumes=[cut.volume("hard")])
     if form == "constant":  # a constant may change
         given["yield_stress"].value, given["hardening"].value = laws["soft"]
     pulled = fem.Constant(cut.mesh, 0.0)
     sides = [f"{name} {side}" for name in laws for side in ("left", "front", "bottom")]
     bcs = held(cut, *sides, *((f"{name} right", pulled) for name in laws))(V)
     finite = kind is tfeti.FiniteJ2Plasticity
-    more = {"finite": True} if finite else {"J": law.tangent(w, v)}
-    more |= {"state": law.state, "update": law.update, "petsc_options": {"rtol": 1e-10}}
-    problem = tfeti.NonlinearContactProblem(law.residual(v), u, bcs, [], cut, **more)
+    more = {"finite": True} if finite else {"J": sum(law.tangent(w, v) for law in made)}
+    F, more["petsc_options"] = sum(law.residual(v) for law in made), {"rtol": 1e-10}
+    problem = tfeti.NonlinearContactProblem(F, u, bcs, [], cut, **more)
     for length in (1.03, 1.06):
         pulled.value = length - 1.0
         accepted(problem)
     strain = np.log(length) if finite else length - 1.0
-    dx = law.dx(subdomain_data=cut.cell_tags)
+    dx = made[0].dx(subdomain_data=cut.cell_tags)
     F = ufl.Identity(3) + ufl.grad(u)
-    stress = law.stress(u)[0, 0] * (ufl.det(F) if finite else 1.0)
+    stress = sum(law.stress(u)[0, 0] for law in made) * (ufl.det(F) if finite else 1.0)
     for name, (start, modulus) in laws.items():
         force = integral(stress * dx(cut.volume(name)))
         expected = (start + modulus * strain) / (1 + modulus / E)  # p = ε − σ/E
+        if (form, name) == ("neo-Hooke", "hard"):
+            # b² across: b² − 1 + λ/μ ln(length b²) = 0
+            ratio = 2 * NU / (1 - 2 * NU)
+            across = brentq(lambda b, r=ratio: b - 1 + r * np.log(length * b), 0.5, 1.0)
+            expected = E / 2 / (1 + NU) * (length**2 - across)
         assert force == pytest.approx(expected, abs=1e-9)
 
 
@@ -276,18 +288,9 @@ def test_stresses_at_nodes_are_those_of_the_points(cell, comm):
     given.interpolate(lambda x: (0.04 * x[1], 0.0 * x[0]))
     elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
     law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=0.1)
-    problem = tfeti.NonlinearContactProblem(
-        law.residual(v),
-        u,
-        [clamp(V, decomposition.facets("side"), given)],
-        [],
-        decomposition,
-        J=law.tangent(w, v),
-        state=law.state,
-        update=law.update,
-        stress=law.stress,
-        petsc_options={"rtol": 1e-10},
-    )
+    bcs, F = [clamp(V, decomposition.facets("side"), given)], law.residual(v)
+    more = {"J": law.tangent(w, v), "stress": law.stress, "petsc_options": {"rtol": 1e-10}}
+    problem = tfeti.NonlinearContactProblem(F, u, bcs, [], decomposition, **more)
     problem.solve()
     mu = E / 2 / (1 + NU)
     q = np.sqrt(3.0) * mu * 0.04
@@ -308,6 +311,8 @@ def test_mistakes_are_named():
         second = fem.Function(fem.functionspace(u.function_space.mesh, ("Lagrange", 2, (2,))))
         with pytest.raises(tfeti.InputError, match="selective=True on quadrilaterals"):
             kind(strain, second, selective=True, **given)
+        with pytest.raises(tfeti.InputError, match="elasticity.on is .*; expected a Decomposition"):
+            kind(strain, u, volumes="a", **given)
         if given:
             with pytest.raises(tfeti.InputError, match="yield_stress"):
                 kind(strain, u, yield_stress=-1.0)
@@ -316,3 +321,23 @@ def test_mistakes_are_named():
                 kind(strain, u, yield_stress=1.0, hardening=x[0] - 1.0)
             with pytest.raises(tfeti.InputError, match="saturation is of shape"):
                 kind(strain, u, yield_stress=1.0, saturation=x)
+
+
+def test_volumes_that_do_not_fit_are_named(comm):
+    parts = [(name, (0.0, y), (1.0, y + 1.0), (2, 2)) for name, y in (("a", 0.0), ("b", 2.0))]
+    halves = {"a": lambda x: x[1] < 1.5, "b": lambda x: x[1] > 1.5}
+    cut = torn_boxes("quadrilateral", parts, 2, volumes=halves)
+    _, u, v, _ = unknowns(cut)
+    elastic = tfeti.Elasticity(cut, E=E, nu=NU, model="plane_strain")
+    for said, volumes in {"no volume 'c' .*: 'a'": "c", "expected names or tags": []}.items():
+        with pytest.raises(tfeti.InputError, match=said):
+            tfeti.NeoHooke(elastic, u, volumes=volumes)
+    some, all_of_it = (
+        tfeti.NeoHooke(elastic, u, volumes="a"),
+        tfeti.SaintVenantKirchhoff(elastic, u),
+    )
+    residuals = {r"J: 4 cells are in no dx; .* without it are: 'b' \(2\)": some.residual(v)}
+    residuals["a SaintV.* of all volumes, and"] = some.residual(v) + all_of_it.residual(v)
+    for said, F in residuals.items():
+        with pytest.raises(tfeti.InputError, match=said):
+            tfeti.NonlinearContactProblem(F, u, [], [], cut)

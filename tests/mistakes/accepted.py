@@ -69,6 +69,9 @@ ACCEPTED = {
             tfeti.Obstacle("bottom", s.floor.shape, friction=tfeti.Tresca(0.1)) for _ in range(2)
         ],
     ),
+    "an integral over a volume beside one over all": lambda s: solved(
+        s, a=s.a + ufl.inner(s.u, s.v) * s.dx(subdomain_data=s.d.cell_tags)(5)
+    ),
     "a sheet that keeps its volume": lambda s: with_elasticity(s, nu=0.5, model="plane_stress"),
     "moduli by tags that numpy made": lambda s: with_elasticity(
         s, E={np.int32(5): np.float32(1.0)}, nu=np.float64(0.3), model="plane_strain"

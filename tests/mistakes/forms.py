@@ -111,6 +111,9 @@ MEASURES = {
     r"L: ds with different subdomain_data; expected one measure ds in a form": lambda s: s.problem(
         L=s.v[0] * s.ds()(4) + s.v[1] * other_ds(s)(3)
     ),
+    r"a: \d cells are in no dx; .* volumes without it are: 'steel' \(5\)": lambda s: s.problem(
+        a=ufl.inner(s.u, s.v) * s.dx(subdomain_data=[(1, np.arange(1, len(s.d.cell_subdomain)))])(1)
+    ),
     r"L: ds\(1\): \d+ of its facets lie inside a body; expected facets of the boundary only, "
     r"such as of decomposition.facets\(name\) or decomposition.locate_facets": lambda s: (
         s.inner.problem(bcs=[], **load(s.inner, s.inner.ds(), 1))

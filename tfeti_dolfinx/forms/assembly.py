@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.forms.checks import check_form, is_zero
+from tfeti_dolfinx.forms.checks import check_covered, check_form, is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 
 
@@ -52,6 +52,7 @@ class Forms:
 
     Attributes:
         names: Those of the bilinear and the linear form, for messages.
+        has_mass: Whether bodies have mass, so that some may do without stiffness.
         given: The forms as they were given, by their names.
         thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
             set.
@@ -64,6 +65,7 @@ class Forms:
     given_loads: Array
     _entries: la.MatrixCSR | None = None
     names: ClassVar[tuple[str, str]] = ("a", "L")
+    has_mass: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -92,6 +94,8 @@ class Forms:
         """Take another bilinear form on the same space."""
         name = self.names[0]
         check_form(a, name, self._V, self._decomposition)
+        if not self.has_mass:
+            check_covered(a, name, self._V, self._decomposition)
         self._a = self._compiled(a, name)
         self._assembled, self._entries = False, None
         self._data = {**self._data, "stiffness": data_of(a, self._V)}
@@ -133,7 +137,15 @@ class Forms:
         return np.array(fem.assemble_vector(self._compiled(form, name)).array)
 
     def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
-        """Return the form compiled by DOLFINx, which fails on all ranks or on none."""
-        comm = self._decomposition.comm
+        """Return the form compiled by DOLFINx, which fails on all ranks or on none.
+
+        DOLFINx takes the tags of one integral of a type for those of all.
+        """
+        comm, parts = self._decomposition.comm, form.integrals()
+        data = {i.integral_type(): d for i in parts if (d := i.subdomain_data()) is not None}
+        of_parts = [data.get(i.integral_type()) for i in parts]
+        if any(i.subdomain_data() is not d for i, d in zip(parts, of_parts, strict=True)):
+            pairs = zip(parts, of_parts, strict=True)
+            form = ufl.Form([i.reconstruct(subdomain_data=d) for i, d in pairs])
         with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):
             return fem.form(form, **self._keywords)

@@ -24,6 +24,7 @@ from ufl.variable import Variable
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.parallel import count_over
 from tfeti_dolfinx.common.validation import checked_type, is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, known_tags
@@ -67,6 +68,31 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
         _check_measures(form, name, decomposition)
     for integral in form.integrals():
         _check_tags(integral, name, decomposition)
+
+
+def check_covered(
+    a: ufl.Form, name: str, V: fem.FunctionSpace, decomposition: Decomposition
+) -> None:
+    """Raise an InputError if cells have unknowns that no integral of a bilinear form is over.
+
+    Collective; it names their volumes.
+    """
+    integrals = a.integrals()
+    tags = {t for i in integrals for t in np.atleast_1d(i.subdomain_id()).tolist()}
+    if any(i.integral_type() != "cell" for i in integrals) or tags & {"everywhere", "otherwise"}:
+        return
+    cells, values = _tagged(integrals[0].subdomain_data(), "cell", decomposition, name)
+    covered, dofs = np.zeros(len(decomposition.cell_subdomain), bool), V.dofmap.list
+    covered[cells[np.isin(values, list(tags))]] = True
+    left = ~covered & ~np.isin(dofs, dofs[covered]).all(axis=1)
+    of_left = decomposition.cell_tags.values[left[decomposition.cell_tags.indices]]
+    found = np.unique(np.concatenate(decomposition.comm.allgather(of_left)))
+    if count := count_over(decomposition.comm, left):
+        volumes = {n: t for n, t in decomposition.names.volumes.items() if t in found}
+        raise InputError(
+            f"{name}: {count} cells are in no dx; expected one over all cells, volumes without it "
+            f"are: {known_tags(volumes)}"
+        )
 
 
 def is_axisymmetric(form: Any, name: str, thickness: Any) -> bool:
@@ -246,6 +272,8 @@ def _check_measures(form: ufl.Form, name: str, decomposition: Decomposition) -> 
             )
         if kind == "interior_facet" and decomposition.is_torn:
             raise InputError("dS has no meaning across the tears of the mesh; use dx and ds(tag)")
+        if data is None:  # all cells, else tags are missed
+            continue
         if data_of.setdefault(kind, data) is not data:
             raise InputError(
                 f"{name}: {KINDS[kind]} with different subdomain_data; expected one measure "

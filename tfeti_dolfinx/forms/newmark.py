@@ -10,7 +10,7 @@ It is half of what the literature has, so that λ are forces: their mean in the 
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -152,6 +152,8 @@ class InertialForms(Forms):
     The arguments are those of ``Forms``; L is the load as it is at the end of the step. ``inertia``
     has M, and where the step begins.
     """
+
+    has_mass: ClassVar[bool] = True
 
     def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
         super().__init__(*as_forms)

@@ -11,7 +11,6 @@ from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.nonlinear.hyperelasticity import displacement_gradient
 from tfeti_dolfinx.nonlinear.materials import IsotropicHardening, Plasticity
-from tfeti_dolfinx.nonlinear.state import LawVariables
 
 # entries of the deformation gradient that a model has, and of a symmetric tensor
 ENTRIES = {
@@ -44,15 +43,13 @@ class FiniteJ2Plasticity(Plasticity):
     of the shear modulus it gets 2s e : e more, with the least s for that: the residual has
     2s sym((F − F̂) F̂⁻¹) added to P, which is 0 at F̂.
 
-    ``NonlinearContactProblem(law.residual(v), u, ..., finite=True, state=law.state,
-    update=law.update, stress=law.stress)`` takes it.
+    ``NonlinearContactProblem(law.residual(v), u, ..., finite=True, stress=law.stress)`` takes it.
 
     Arguments are those of ``J2Plasticity``.
 
     Attributes:
         inverse_plastic: C_p⁻¹ where the load step began, components xx, yy, zz, xy, xz, yz.
         p: Accumulated plastic strain there.
-        state: What ``NonlinearContactProblem`` takes as ``state``.
     """
 
     def _begin(self) -> None:
@@ -65,17 +62,16 @@ class FiniteJ2Plasticity(Plasticity):
         self.inverse_plastic.x.array[:] = np.tile(
             [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], len(self.p.x.array)
         )
-        self._mu, self._kappa, self._more = (fem.Function(scalar) for _ in range(3))
-        self._G = fem.Function(vector)
-        self._P, self._dP = fem.Function(vector), fem.Function(self._at.space((m, m)))
+        self._mu, self._kappa = fem.Function(scalar), fem.Function(scalar)
+        self._more, self._G = self._updated(scalar), self._updated(vector)
+        self._P, self._dP = self._updated(vector), self._updated(self._at.space((m, m)))
         points = interpolation_points(scalar)
         self._mu_of_x = fem.Expression(elasticity.mu, points)
         self._kappa_of_x = fem.Expression(self._bulk * ufl.as_ufl(1.0), points)
         self._points = len(points)
         self._G_of_u = fem.Expression(self._gradient(u), points)
         self._new = (np.array(self.inverse_plastic.x.array), np.array(self.p.x.array))
-        values = {self.inverse_plastic: lambda: self._new[0], self.p: lambda: self._new[1]}
-        self.state = LawVariables(self, values)
+        self.state = {self.inverse_plastic: lambda: self._new[0], self.p: lambda: self._new[1]}
         self.update()
 
     def update(self) -> None:
@@ -86,29 +82,32 @@ class FiniteJ2Plasticity(Plasticity):
         self._G.interpolate(self._G_of_u)
         self._mu.interpolate(self._mu_of_x)
         self._kappa.interpolate(self._kappa_of_x)
-        F = np.zeros((len(self.p.x.array), 3, 3))
+        own, p = self._rows, self.p.x.array[self._rows]
+        F = np.zeros((len(p), 3, 3))
         rows, columns = np.array(self._entries).T
-        F[:, rows, columns] = self._G.x.array.reshape(len(F), -1)
+        F[:, rows, columns] = self._G.x.array.reshape(-1, len(rows))[own]
         F += np.eye(3)
         out = ~(np.linalg.det(F) > 0.0)
         F[out] = np.eye(3)
-        components = self.inverse_plastic.x.array.reshape(-1, 6)
+        components = self.inverse_plastic.x.array.reshape(-1, 6)[own]
         inverse_plastic = np.empty_like(F)
         for k, (i, j) in enumerate(SYMMETRIC):
             inverse_plastic[:, i, j] = inverse_plastic[:, j, i] = components[:, k]
         hardening = self.hardening()
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
-            point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, hardening)
+            point = _Return(F, inverse_plastic, p, self._mu.x.array[own], hardening)
         P, dP = point.P, point.tangent(self._entries)
         P[out] = dP[out] = np.nan
         dilatation = np.log(np.linalg.det(F))
         if self._at.selective:  # that of the centre of the cell, nearly
             cells = dilatation.reshape(-1, self._points)
             dilatation = np.repeat(cells.mean(axis=1), self._points)
-        self._more.x.array[:] = point.missing(self._kappa.x.array, dilatation)
-        self._P.x.array[:] = P[:, rows, columns].ravel()
-        self._dP.x.array[:] = dP.ravel()
-        self._new = point.end()
+        self._more.x.array[own] = point.missing(self._kappa.x.array[own], dilatation)
+        self._P.x.array.reshape(-1, len(rows))[own] = P[:, rows, columns]
+        m = len(rows) ** 2
+        self._dP.x.array.reshape(-1, m)[own] = dP.reshape(-1, m)
+        for new, end, width in zip(self._new, point.end(), (6, 1), strict=True):
+            new.reshape(-1, width)[own] = end.reshape(-1, width)
 
     def stress(self, u: Any) -> Any:
         """Return Cauchy's stress, 3×3, of the displacement that ``update`` was called for."""
@@ -118,7 +117,7 @@ class FiniteJ2Plasticity(Plasticity):
         if self.elasticity.model == "plane_strain":  # it is a deviator
             across = ufl.as_tensor([[0, 0, 0], [0, 0, 0], [0, 0, 1]])
             tau = tau - (tau[0, 0] + tau[1, 1]) * across
-        return (tau + self._bulk * ufl.ln(J) * ufl.Identity(3)) / J
+        return self._in_volumes((tau + self._bulk * ufl.ln(J) * ufl.Identity(3)) / J)
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫P:∇v, whose derivative is that of the return."""

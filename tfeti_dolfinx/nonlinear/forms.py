@@ -172,6 +172,8 @@ class InertialNewtonForms(NewtonForms):
     ``inertia`` has M, and where the step begins; its loads are −F.
     """
 
+    has_mass: ClassVar[bool] = True
+
     def __init__(self, mass: ufl.Form, *as_forms: Any, u: fem.Function, finite: bool) -> None:
         super().__init__(*as_forms, u=u, finite=finite)
         self.inertia = Inertia(mass, self._V, self._decomposition, self._compiled)

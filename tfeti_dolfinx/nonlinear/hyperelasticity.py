@@ -1,6 +1,6 @@
 """Hyperelastic materials in finite strain."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from math import pi
 from typing import Any
 
@@ -10,13 +10,13 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.validation import POSITIVE, checked_number
 from tfeti_dolfinx.forms.elasticity import Elasticity
-from tfeti_dolfinx.nonlinear.materials import Quadrature, check_law
+from tfeti_dolfinx.nonlinear.materials import Material, Volumes
 
 
-class Hyperelasticity(ABC):
+class Hyperelasticity(Material):
     """A body with an energy in finite strain, on the mesh as it was. Creation is collective.
 
-    ``NonlinearContactProblem(law.residual(v), u, ..., finite=True, update=law.update)`` takes it.
+    ``NonlinearContactProblem(law.residual(v), u, ..., finite=True)`` takes it.
 
     A tangent has to be definite on all that stretches. Where a law loses that, its tangent gets
     2s e : e more, e = sym(∇w F⁻¹), with the least s that a bound asks for, so that it keeps a share
@@ -31,6 +31,7 @@ class Hyperelasticity(ABC):
         selective: Whether what resists a change of volume is integrated at the centre of each cell,
             on quadrilaterals and hexahedra of degree 1: rubber hardly changes its volume, and cells
             that are fully integrated, or simplices of degree 1, are too stiff for it (locking).
+        volumes: Those of this law, as of ``J2Plasticity``.
         definite: Share of the shear modulus that the tangent keeps.
 
     Raises:
@@ -44,16 +45,14 @@ class Hyperelasticity(ABC):
         *,
         degree: int | None = None,
         selective: bool = False,
+        volumes: Volumes = None,
         definite: float = 0.05,
     ) -> None:
-        check_law(elasticity, u, type(self).__name__)
-        self.elasticity, self.u = elasticity, u
+        super().__init__(elasticity, u, degree, selective, volumes)
         E, nu = elasticity.E, elasticity.nu
         self._lmbda = E * nu / (1 + nu) / (1 - 2 * nu)
         self.definite = checked_number(definite, "definite", POSITIVE)
-        self._at = Quadrature.of(u, degree, selective)
-        self.dx = self._at.dx
-        self._here = fem.Function(u.function_space)
+        self._here = self._updated(u.function_space)
         self.update()
 
     @abstractmethod
@@ -77,7 +76,7 @@ class Hyperelasticity(ABC):
         F = ufl.variable(self.deformation(u))
         of_volume, of_shape = self.energies(F)
         P = ufl.diff(of_volume + of_shape, F)
-        return P * F.T / ufl.det(F)
+        return self._in_volumes(P * F.T / ufl.det(F))
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫P(u):∇v, P = ∂ψ/∂F, with a tangent that is definite on stretches."""

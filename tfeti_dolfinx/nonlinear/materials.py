@@ -1,16 +1,18 @@
-"""Materials in small strain: J2 plasticity, and what hardens."""
+"""Ready laws: where they hold and who updates them, J2 plasticity in small strain."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import basix.ufl
 import numpy as np
 import ufl
 from dolfinx import fem
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.common.validation import (
@@ -22,7 +24,11 @@ from tfeti_dolfinx.common.validation import (
 )
 from tfeti_dolfinx.errors import ConvergenceError, InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.elasticity import Elasticity, Modulus, in_ufl
-from tfeti_dolfinx.nonlinear.state import LawVariables
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.nonlinear.state import NewValue
+
+# volumes by their names or tags; None: all
+Volumes: TypeAlias = "str | int | Sequence[str | int] | None"
 
 
 @dataclass(frozen=True)
@@ -106,13 +112,16 @@ class Quadrature:
     mesh: Any  # the torn mesh
     degree: int  # degree of the quadrature
     selective: bool  # whether what resists a change of volume is integrated at the centre of a cell
+    inside: dict[str, Any] = field(default_factory=dict)  # of a measure of some volumes
     # how far from the centre, of a reference cell of length 1, the two points of that rule are:
     # FFCx 0.9 takes values at a single point for those of other rules, too, and values that differ
     # by 1e-6 for the same; forces of a homogeneous strain are off by the square
     beside: float = 1e-5
 
     @classmethod
-    def of(cls, u: fem.Function, degree: int | None, selective: bool) -> Quadrature:
+    def of(
+        cls, u: fem.Function, degree: int | None, selective: bool, inside: dict[str, Any]
+    ) -> Quadrature:
         """Return that of a displacement; the default degree is exact on affine cells.
 
         Raise an InputError where selective integration does not fit the displacement.
@@ -127,13 +136,13 @@ class Quadrature:
             )
         if degree is None:
             degree = max(2 * own - (2 if simplex else 0), 1)
-        return cls(V.mesh, degree, selective)
+        return cls(V.mesh, degree, selective, inside)
 
     @property
     def dx(self) -> ufl.Measure:
         """The measure of cells."""
         data = {"quadrature_degree": self.degree, "quadrature_scheme": "default"}
-        return ufl.Measure("dx", domain=self.mesh, metadata=data)
+        return ufl.Measure("dx", domain=self.mesh, metadata=data, **self.inside)
 
     @property
     def dx_volume(self) -> ufl.Measure:
@@ -144,7 +153,7 @@ class Quadrature:
         points = tuple((0.5 + shift,) * dim for shift in (-self.beside, self.beside))
         rule = {"quadrature_rule": "custom", "quadrature_points": points}
         rule |= {"quadrature_weights": (0.5, 0.5)}
-        return ufl.Measure("dx", domain=self.mesh, metadata=rule)
+        return ufl.Measure("dx", domain=self.mesh, metadata=rule, **self.inside)
 
     def space(self, shape: tuple[int, ...] = ()) -> fem.FunctionSpace:
         """Return the space of values at the points."""
@@ -153,14 +162,99 @@ class Quadrature:
         return fem.functionspace(self.mesh, element)
 
 
-class Plasticity(ABC):
+class Material(ABC):
+    """A ready law, of all volumes or of some. Creation is collective.
+
+    A problem calls ``update`` where its forms have functions that this sets, and commits ``state``.
+
+    Attributes:
+        elasticity: The elastic law.
+        u: The displacement.
+        volumes: Tags of the volumes; None: all.
+        dx: The measure of their cells.
+        state: Internal variables with their values at the end of a load step.
+    """
+
+    def __init__(
+        self,
+        elasticity: Elasticity,
+        u: fem.Function,
+        degree: int | None,
+        selective: bool,
+        volumes: Volumes,
+    ) -> None:
+        check_law(elasticity, u, name := type(self).__name__)
+        self.elasticity, self.u, on = elasticity, u, elasticity.on
+        self.volumes: list[int] | None = None
+        self.state: Mapping[fem.Function, NewValue] = {}
+        self._inside: fem.Function | None = None
+        inside: dict[str, Any] = {}
+        if volumes is not None:
+            checked_type(on, Decomposition, f"{name}: volumes=: elasticity.on", "a Decomposition")
+            with agreeing(on.comm, name) as given:
+                names = volumes if isinstance(volumes, (list, tuple)) else [volumes]
+                given["volumes"] = self.volumes = sorted({on.volume(one) for one in names})
+                if not names:
+                    raise InputError(f"{name}: volumes are none; expected names or tags")
+            inside = {"subdomain_data": on.cell_tags, "subdomain_id": tuple(self.volumes)}
+            self._inside = fem.Function(fem.functionspace(on.mesh, ("DG", 0)))
+            self._inside.x.array[self._rows_of(self._inside)] = 1.0
+        self._at = Quadrature.of(u, degree, selective, inside)
+        self.dx = self._at.dx
+
+    @abstractmethod
+    def update(self) -> None:
+        """Take ``u`` as it is now. Collective."""
+
+    def _updated(self, V: fem.FunctionSpace, name: str | None = None) -> fem.Function:
+        """Return a function that ``update`` sets, by which forms tell that they have the law."""
+        function = fem.Function(V, name=name)
+        function.law = self
+        return function
+
+    def _rows_of(self, function: fem.Function) -> Any:
+        """Return which values of a scalar function belong to cells of the law, cell by cell."""
+        if self.volumes is None:
+            return slice(None)
+        tags = self.elasticity.on.cell_tags
+        cells = tags.indices[np.isin(tags.values, self.volumes)]
+        return np.asarray(function.function_space.dofmap.list)[cells].ravel()
+
+    def _in_volumes(self, stress: Any) -> Any:
+        """Return a stress that is 0 outside of the volumes."""
+        return stress if self._inside is None else self._inside * stress
+
+
+def laws_of(forms: Sequence[ufl.Form], update: Any, u: fem.Function) -> list[Material]:
+    """Return the laws of u in forms, and the one whose method ``update`` is.
+
+    Raise an InputError where that is of another displacement, or volumes are not told apart.
+    """
+    found = [getattr(f, "law", None) for form in forms for f in form.coefficients()]
+    laws = dict.fromkeys(law for law in found if isinstance(law, Material) and law.u is u)
+    if isinstance(law := getattr(update, "__self__", None), Material):
+        if law.u is not u:
+            raise InputError(
+                f"update is a method of a {type(law).__name__} of another displacement; expected "
+                "one that was made with u"
+            )
+        laws[law] = None
+    everywhere = [law for law in laws if law.volumes is None]
+    if everywhere and len(everywhere) < len(laws):
+        raise InputError(
+            f"F has a {type(everywhere[0]).__name__} of all volumes, and another law of some; "
+            "expected volumes= of both"
+        )
+    return list(laws)
+
+
+class Plasticity(Material):
     """Plasticity by von Mises with isotropic hardening, in small or in finite strain.
 
     Creation is collective; arguments are those of ``J2Plasticity``.
 
     Attributes:
         given: Yield stress, hardening modulus, saturation and rate in UFL, by their names.
-        dx: The measure of cells.
     """
 
     def __init__(
@@ -174,20 +268,19 @@ class Plasticity(ABC):
         rate: Modulus = 0.0,
         degree: int | None = None,
         selective: bool = False,
+        volumes: Volumes = None,
         tolerances: ReturnTolerances | None = None,
     ) -> None:
-        check_law(elasticity, u, type(self).__name__)
-        self.elasticity, self.u = elasticity, u
+        super().__init__(elasticity, u, degree, selective, volumes)
         self._bulk = elasticity.E / 3 / (1 - 2 * elasticity.nu)
         values = zip(HARDENING.items(), (yield_stress, hardening, saturation, rate), strict=True)
         self.given = {
             name: in_ufl(value, elasticity.on, name, expected) for (name, expected), value in values
         }
         self._tolerances = tolerances or ReturnTolerances()
-        self._at = Quadrature.of(u, degree, selective)
-        self.dx = self._at.dx
         scalar = self._at.space()
         self._value, points = fem.Function(scalar), interpolation_points(scalar)
+        self._rows = self._rows_of(self._value)
         self._at_points = {
             name: value if isinstance(value, fem.Constant) else fem.Expression(value, points)
             for name, value in self.given.items()
@@ -200,7 +293,7 @@ class Plasticity(ABC):
         """Make functions and expressions at the quadrature points."""
 
     def hardening(self) -> IsotropicHardening:
-        """Return yield stress and hardening with their values at the quadrature points. Collective.
+        """Return yield stress and hardening with their values at its quadrature points. Collective.
 
         Raise an InputError where a value does not fit; the message names it.
         """
@@ -210,7 +303,7 @@ class Plasticity(ABC):
                 values[name] = np.asarray(value.value)
             else:
                 self._value.interpolate(value)
-                values[name] = self._value.x.array.copy()
+                values[name] = np.array(self._value.x.array[self._rows])
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
             return IsotropicHardening(**values, tolerances=self._tolerances)
 
@@ -245,13 +338,14 @@ class J2Plasticity(Plasticity):
         selective: Whether the change of volume is integrated at the centre of each cell, on
             quadrilaterals and hexahedra of degree 1: plastic flow keeps the volume, and cells that
             are fully integrated, or simplices of degree 1, are too stiff for it (locking).
+        volumes: Those of this law, a name or tag or several; default all. ``residual`` and
+            ``tangent`` are integrals over them, ``stress`` is 0 elsewhere.
         tolerances: Those of the return.
 
     Attributes:
         plastic_strain: Plastic strain where the load step began, components xx, yy, zz, xy and in
             space xz, yz.
         p: Accumulated plastic strain there.
-        state: What ``NonlinearContactProblem`` takes as ``state``.
 
     Raises:
         InputError: Something given does not fit; the message names it.
@@ -262,8 +356,8 @@ class J2Plasticity(Plasticity):
         Q, W = self._at.space(), self._at.space((6 if self._gdim == 3 else 4,))
         self.plastic_strain = fem.Function(W, name="plastic_strain")
         self.p = fem.Function(Q, name="accumulated_plastic_strain")
-        self._dp = fem.Function(Q, name="plastic_increment")  # of this load step
-        self._slope = fem.Function(Q, name="hardening_slope")
+        self._dp = self._updated(Q, name="plastic_increment")  # of this load step
+        self._slope = self._updated(Q, name="hardening_slope")
         self._q_and_G, s = fem.Function(self._at.space((2,))), self._trial(u)
         q_and_G = ufl.as_vector((ufl.sqrt(1.5 * ufl.inner(s, s)), elasticity.mu))
         self._q_and_G_of_u = fem.Expression(q_and_G, interpolation_points(Q))
@@ -271,25 +365,24 @@ class J2Plasticity(Plasticity):
         new = self._tensor(self.plastic_strain) + self._dp * self._n
         places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
         components = [new[i, j] for i, j in places[: 6 if self._gdim == 3 else 4]]
-        values = {self.plastic_strain: ufl.as_vector(components), self.p: self.p + self._dp}
-        self.state = LawVariables(self, values)
+        self.state = {self.plastic_strain: ufl.as_vector(components), self.p: self.p + self._dp}
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""
         self._q_and_G.interpolate(self._q_and_G_of_u)
-        q, G = self._q_and_G.x.array.reshape(-1, 2).T.copy()
+        q, G = self._q_and_G.x.array.reshape(-1, 2)[self._rows].T.copy()
         hardening = self.hardening()
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
             if not np.all(np.isfinite(q)):
                 raise InputError("J2Plasticity: the stress is not finite")
-            dp, slope = hardening.returned(q, G, self.p.x.array)
-        self._dp.x.array[:] = dp
-        self._slope.x.array[:] = slope
+            dp, slope = hardening.returned(q, G, self.p.x.array[self._rows])
+        self._dp.x.array[self._rows] = dp
+        self._slope.x.array[self._rows] = slope
 
     def stress(self, u: Any) -> Any:
         """Return the stress, 3×3, of the displacement that ``update`` was called for."""
         e = self.elasticity.strain(u)
-        return self._bulk * ufl.tr(e) * ufl.Identity(3) + self._deviator(u)
+        return self._in_volumes(self._bulk * ufl.tr(e) * ufl.Identity(3) + self._deviator(u))
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫σ(u):ε(v)."""

@@ -25,8 +25,9 @@ from tfeti_dolfinx.errors import (
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms, rotation_free_tangent
+from tfeti_dolfinx.nonlinear.materials import laws_of
 from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonTolerances
-from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue, check_state
+from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
 from tfeti_dolfinx.solution import Solution
@@ -67,9 +68,10 @@ class NonlinearContactProblem(ContactProblem):
         decomposition: The torn mesh.
         J: Derivative of F, a symmetric bilinear form; default ``ufl.derivative(F, u)``.
         state: Internal variables: for each function what gives its value at the end of a load
-            step, see ``InternalVariables``. They are committed by ``accept``.
+            step, see ``InternalVariables``. They are committed by ``accept``. Those of ready laws
+            in F or J need not be given.
         update: Called without arguments when ``u`` has changed, before a form is assembled: for
-            functions in F and J that depend on u.
+            functions in F and J that depend on u. Those of ready laws are set after it.
         finite: Whether strains and displacements are finite: F is integrated on the mesh as it
             was, contact and friction act where the bodies are, at X + u. J may not be given: the
             tangent knows no rotations, see ``rotation_free_tangent``. After each solve
@@ -132,8 +134,12 @@ class NonlinearContactProblem(ContactProblem):
             elif J is None:
                 J = ufl.derivative(F, u)
             checked_type(J, ufl.Form, "J", "a bilinear form")
-            check_state(update, state, u)
-            given["state"] = list(state) if isinstance(state, Mapping) else []
+            laws = laws_of((F, J), update, u)
+            state = {} if state is None else state
+            checked_type(state, Mapping, "state", "a dictionary from functions to their new values")
+            of_laws = [item for law in laws for item in law.state.items() if item[0] not in state]
+            state = {**state, **dict(of_laws)}
+            given["state"] = list(state)
             tolerances = NewtonTolerances() if tolerances is None else tolerances
             checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")
             given["tolerances"] = asdict(tolerances)
@@ -142,8 +148,10 @@ class NonlinearContactProblem(ContactProblem):
         self._forcing = forcing if tolerances.forcing is None else tolerances.forcing
         self._loosest = loosest if tolerances.loosest is None else tolerances.loosest
         self._curvature = curvature if tolerances.curvature is None else tolerances.curvature
-        self._update = update
-        self._state = InternalVariables({} if state is None else state, decomposition.mesh)
+        self._updates = [law.update for law in laws]
+        if update is not None and update not in self._updates:
+            self._updates.insert(0, update)
+        self._state = InternalVariables(state, decomposition.mesh)
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
@@ -364,9 +372,10 @@ class NonlinearContactProblem(ContactProblem):
     def _set(self, u: Array) -> None:
         """Take a displacement, and what depends on it. Collective."""
         self.u.x.array[:], self._system.forms.known = u, None
-        if self._update is not None:
+        if self._updates:
             with raised_on_all_ranks(self.decomposition.comm), named("update"):
-                self._update()
+                for update in self._updates:
+                    update()
 
     def _line_search(self, u: Array, d: Array) -> tuple[float, Array]:
         """Go to u + t d, and return the length t in (0, 1], and |r(1)/r(0)| of bodies. Collective.

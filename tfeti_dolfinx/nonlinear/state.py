@@ -13,21 +13,8 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.common.validation import checked_type, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.forms.elasticity import Elasticity
 
 NewValue = Any  # a UFL expression, or a callable that returns an array of the function's size
-
-
-class LawVariables(dict[fem.Function, NewValue]):
-    """Internal variables of a law that has to be updated: what ``state`` takes.
-
-    Attributes:
-        law: The law, whose method ``update`` the problem needs.
-    """
-
-    def __init__(self, law: Any, values: Mapping[fem.Function, NewValue]) -> None:
-        super().__init__(values)
-        self.law = law
 
 
 class InternalVariables:
@@ -49,7 +36,6 @@ class InternalVariables:
     def __init__(self, given: Mapping[fem.Function, NewValue], mesh: Any) -> None:
         self._comm: MPI.Intracomm = mesh.comm
         self._new: list[tuple[fem.Function, Callable[[], Array]]] = []
-        checked_type(given, Mapping, "state", "a dictionary from functions to their new values")
         for function, value in given.items():
             checked_type(function, fem.Function, "state: a key", "a dolfinx.fem.Function")
             name = f"state: the new value of {function.name}"
@@ -100,32 +86,6 @@ class InternalVariables:
                 found.append(new)
         for function, new in zip(self.functions, found, strict=True):
             function.x.array[:] = new
-
-
-def check_state(update: Any, state: Any, u: fem.Function) -> None:
-    """Raise if of a material ``update`` or ``state`` is missing, or it is one of another ``u``."""
-    if update is None and isinstance(state, LawVariables):
-        name = type(state.law).__name__
-        raise InputError(
-            f"state is that of a {name}, whose stresses would never be returned to the yield "
-            "surface; expected update=, its method"
-        )
-    law = getattr(update, "__self__", None)
-    made = isinstance(getattr(law, "elasticity", None), Elasticity)  # as ready laws are
-    if made and getattr(law, "u", u) is not u:
-        raise InputError(
-            f"update is a method of a {type(law).__name__} of another displacement; expected one "
-            "that was made with u"
-        )
-    variables = getattr(law, "state", None)
-    if not isinstance(variables, Mapping):
-        return
-    left = [f.name for f in variables if not any(f is g for g in (state or {}))]
-    if left:
-        raise InputError(
-            f"update is a method of {type(law).__name__}, whose internal variables "
-            f"{', '.join(left)} would never be committed; expected state=, its attribute"
-        )
 
 
 def _of_cells(function: fem.Function) -> Array:
