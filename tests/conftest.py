@@ -11,6 +11,7 @@ os.environ["XDG_CONFIG_HOME"] = f"{os.path.dirname(__file__)}/config"
 
 import pytest
 import quick_demos
+from ffcx.codegeneration import jit
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.internal.conjecture import providers
@@ -29,6 +30,21 @@ settings.load_profile("ranks")
 # newer versions draw from constants of the modules loaded, and ranks do not load the same ones
 if hasattr(providers, "_get_local_constants"):
     providers._get_local_constants = lambda none=providers._local_constants: none
+
+COMPILED = {}
+
+
+def look_once(module, *rest, look=jit.get_cached_module):
+    """FFCx lists the folder of all compiled forms each time: it takes longer than loading one."""
+    if module not in COMPILED:
+        found = look(module, *rest)
+        if found[0] is None:  # to be compiled
+            return found
+        COMPILED[module] = found
+    return COMPILED[module]
+
+
+jit.get_cached_module = look_once
 
 LATER = 1.1  # pytest-timeout, which names the test, comes first where it can
 STDERR = pytest.StashKey[int]()
