@@ -35,17 +35,13 @@ COMPILED = {}
 
 
 def look_once(module, *rest, look=jit.get_cached_module):
-    """FFCx lists the folder of all compiled forms each time: it takes longer than loading one."""
-    if module not in COMPILED:
-        found = look(module, *rest)
-        if found[0] is None:  # to be compiled
-            return found
+    """FFCx lists a folder of thousands of files each time, which takes longer than to load one."""
+    if (found := COMPILED.get(module) or look(module, *rest))[0] is not None:  # else it compiles
         COMPILED[module] = found
-    return COMPILED[module]
+    return found
 
 
 jit.get_cached_module = look_once
-
 LATER = 1.1  # pytest-timeout, which names the test, comes first where it can
 STDERR = pytest.StashKey[int]()
 

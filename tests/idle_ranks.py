@@ -19,8 +19,8 @@ def test_demos(name, comm, shared_tmp, monkeypatch):
     for name_of_maker in ("make_parts", "given_subdomains"):
         monkeypatch.setattr(tearing, name_of_maker, few)
     report_file, folder = shared_tmp / "report.json", shared_tmp / "out"
-    plot = ["--plot"] * (name == "cylinder_on_block_2d")
-    outputs = ["--report", report_file, "--output", folder, *plot]
+    outputs = ["--report", report_file, "--output", folder]
+    outputs += ["--plot"] * (name == "cylinder_on_block_2d")
     solution, _ = demos.run(name, ["--quick", *outputs])
     assert comm.allreduce(len(solution.decomposition.subdomains), op=MPI.MIN) == 0
     comm.barrier()

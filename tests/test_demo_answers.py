@@ -216,9 +216,7 @@ def test_stacked_blocks_are_held_by_contact_alone(quick_demo):
     ],
     ids=str,
 )
-def test_a_half_ball_of_rubber_is_right_to_a_hundred_thousandth_of_its_radius(
-    words, steps, most, comm
-):
+def test_a_half_ball_of_rubber_is_right_to_a_hundred_thousandth_of_its_radius(words, steps, most):
     """Beside tight tolerances; at the demo's own few tangents a load step and multiplications."""
     made = demos.scene("rubber_pressed_3d", words, "NonlinearContactProblem")
     u, down, ends = made["u"], made["bcs"][0].g, []

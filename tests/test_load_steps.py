@@ -178,30 +178,26 @@ def run_to_the_end(*given):
     assert result.returncode == 0, result.stderr
 
 
-# what is solved without a stop on so many ranks, and which of it only begins, too; they start once,
-# in the first test that asks
-WHOLE = {
+# what is solved on so many ranks; they start once, in the first test that asks
+SERIES = {
     1: ["smooth", "stabilised", "tool"],
     2: ["rough", "coulomb", "plastic", "thrown", "apart"],
 }
-BEGUN = {1: ["tool"], 2: ["coulomb", "plastic", "thrown", "apart"]}
 
 
 @pytest.fixture(scope="module")
 def series(tmp_path_factory):
-    """The folder of a series that nobody stops, and of one that ends after three steps."""
+    """The folder of series that nobody stops, ``whole``, and that are ``begun``."""
     known = {}
 
-    def of(ranks, scene, how):
-        if (ranks, scene, how) not in known:
+    def of(ranks, scene):
+        if (ranks, scene) not in known:
             top = tmp_path_factory.mktemp("series")
-            words = {"whole": WHOLE[ranks], "begun": BEGUN[ranks]}
-            if scene not in words[how]:
-                words = {how: [scene]}
-            folders = {(ranks, name, how): top / how / name for how in words for name in words[how]}
-            run_to_the_end(ranks, *(w for key, path in folders.items() for w in (key[2], path)))
-            known.update(folders)
-        return known[ranks, scene, how]
+            scenes = SERIES[ranks] if scene in SERIES[ranks] else [scene]
+            both = [(how, *(top / how / name for name in scenes)) for how in ("whole", "begun")]
+            run_to_the_end(ranks, *both[0], *both[1])
+            known.update({(ranks, name): top for name in scenes})
+        return known[ranks, scene]
 
     return of
 
@@ -227,9 +223,8 @@ def test_a_killed_series_goes_on_to_the_same_answer(
     index = json.loads((folder / "checkpoint" / "checkpoint.json").read_text())
     assert index["number"] == done
     run_to_the_end(ranks, "resume", folder)
-    found, expected = (
-        np.load(path / "found.npz") for path in (folder, series(ranks, scene, "whole"))
-    )
+    found = np.load(folder / "found.npz")
+    expected = np.load(series(ranks, scene) / "whole" / scene / "found.npz")
     assert set(found) == set(expected)
     for name in expected:
         values, scale = found[name], np.abs(expected[name]).max(initial=0.0)
@@ -254,12 +249,12 @@ def test_a_killed_series_goes_on_to_the_same_answer(
 def test_a_checkpoint_of_other_ranks(serial_only, tmp_path, series, before, scenes):
     folders = {tmp_path / name: after for after in scenes for name in scenes[after]}
     for folder in folders:
-        shutil.copytree(series(before, folder.name, "begun"), folder)
+        shutil.copytree(series(before, folder.name) / "begun" / folder.name, folder)
     for after in scenes:
         run_to_the_end(after, "resume", *(tmp_path / name for name in scenes[after]))
     for folder, after in folders.items():
         found = np.load(folder / "found.npz")
-        expected = np.load(series(before, folder.name, "whole") / "found.npz")
+        expected = np.load(series(before, folder.name) / "whole" / folder.name / "found.npz")
         for name in ("x", "u", "figures"):
             scale = np.abs(expected[name]).max()
             assert np.allclose(found[name], expected[name], rtol=0, atol=1e-10 * scale), name
