@@ -121,7 +121,7 @@ def solve(folder, how):
             die()
         driven.apply(problem, t)
 
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     times = TIMES[:3] if how == "begun" else TIMES
     steps = tfeti.LoadSteps(
         driven.problem, apply, times, path=folder / "series.bp", checkpoint=folder / "checkpoint"
@@ -141,8 +141,8 @@ def solve(folder, how):
 
 
 if __name__ == "__main__":
-    how, *folders = sys.argv[1:]
-    if how in DEATHS:
-        die_at(*DEATHS[how])
-    for folder in folders:
-        solve(Path(folder), how)
+    for word in sys.argv[1:]:  # how the folders after it are run, or a folder
+        if Path(word).is_absolute():
+            solve(Path(word), how)  # noqa: F821
+        elif (how := word) in DEATHS:
+            die_at(*DEATHS[how])

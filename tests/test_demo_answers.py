@@ -208,16 +208,22 @@ def test_stacked_blocks_are_held_by_contact_alone(quick_demo):
 
 
 @pytest.mark.parametrize(
-    "words", [["--quick"], ["--size", "0.22"], pytest.param([], marks=pytest.mark.slow)], ids=str
+    ("words", "steps", "most"),  # multiplications of a load step
+    [
+        (["--quick"], 2, 36),
+        (["--size", "0.22"], 4, 31),
+        pytest.param([], 8, 68.5, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
-def test_a_half_ball_of_rubber_is_right_to_a_hundred_thousandth_of_its_radius(words, comm):
+def test_a_half_ball_of_rubber_is_right_to_a_hundred_thousandth_of_its_radius(words, steps, most):
     """Beside tight tolerances; at the demo's own few tangents a load step and multiplications."""
     made = demos.scene("rubber_pressed_3d", words, "NonlinearContactProblem")
     u, down, ends = made["u"], made["bcs"][0].g, []
     for options in (made.pop("petsc_options"), {"tfeti_rtol": 1e-8}):
         u.x.array[:], found, reports = 0.0, [], []
         problem = tfeti.NonlinearContactProblem(**made, petsc_options=options)
-        for depth in np.linspace(0.0, 0.4, 3 if "--quick" in words else 9)[1:]:
+        for depth in np.linspace(0.0, 0.4, steps + 1)[1:]:
             down.value[2] = -depth
             reports.append(accepted(problem))
             found.append(np.array(u.x.array))
@@ -225,4 +231,4 @@ def test_a_half_ball_of_rubber_is_right_to_a_hundred_thousandth_of_its_radius(wo
     (found, reports), (tight, _) = ends
     assert largest(found - tight) <= 1e-5
     assert max(report.assemblies for report in reports) <= 5
-    assert sum(report.F_multiplications for report in reports) <= 548
+    assert sum(report.F_multiplications for report in reports) <= most * steps

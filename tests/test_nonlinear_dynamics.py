@@ -179,8 +179,8 @@ def test_a_block_that_turns_on_another_one_gains_no_energy(comm):
     pair = tfeti.Contact("upper bottom", "lower top", reach=1.0)
     problem, kept = flying(d, thrown, [pair], rtol=1e-7, stabilised=True)
     begin = kept()
-    problem.take_step(0.04)
-    for n in range(30):
+    problem.take_step(0.06)
+    for n in range(20):
         u = np.array(problem.solve().x.array) if n % 6 == 0 else None
         accepted(problem)
         assert u is None or largest(problem.u.x.array - u) <= 1e-7
@@ -220,12 +220,13 @@ def test_a_plastic_impact_loses_energy_and_goes_on_from_its_checkpoint(comm, sha
         v = problem.solution.velocity.x.array.copy()
         return records, problem.u.x.array.copy(), v, steel.p.x.array.copy()
 
-    records, *whole = series(40, "whole")
+    _, *whole = series(14, "whole")
     series(9, "parts")
-    _, *parts = series(40, "parts", resume=True)
+    _, *parts = series(14, "parts", resume=True)
     for found, expected in zip(parts, whole, strict=True):
         assert largest(found - expected) <= 1e-7
     assert largest(whole[2]) > 0.01
+    records = series(40, "whole", resume=True)[0]
     begin, end = 0.5 * 3.0 * 0.1**2, records[-1].motion["kinetic"]
     assert end < 0.8 * begin  # an elastic bar keeps nearly all
     assert records[-1].contact_forces[0] == [0.0, 0.0]

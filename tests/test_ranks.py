@@ -14,7 +14,8 @@ HERE = Path(__file__).resolve().parent
 
 
 def run(ranks, *arguments, limit=300):
-    command = ["mpirun", "-n", str(ranks), sys.executable, *map(str, arguments)]
+    start = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
+    command = [*start, sys.executable, *map(str, arguments)]
     return subprocess.run(command, cwd=HERE, capture_output=True, text=True, timeout=limit)
 
 
