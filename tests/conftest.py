@@ -11,7 +11,6 @@ os.environ["XDG_CONFIG_HOME"] = f"{os.path.dirname(__file__)}/config"
 
 import pytest
 import quick_demos
-from ffcx.codegeneration import jit
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.internal.conjecture import providers
@@ -31,17 +30,6 @@ settings.load_profile("ranks")
 if hasattr(providers, "_get_local_constants"):
     providers._get_local_constants = lambda none=providers._local_constants: none
 
-COMPILED = {}
-
-
-def look_once(module, *rest, look=jit.get_cached_module):
-    """FFCx lists a folder of thousands of files each time, which takes longer than to load one."""
-    if (found := COMPILED.get(module) or look(module, *rest))[0] is not None:  # else it compiles
-        COMPILED[module] = found
-    return found
-
-
-jit.get_cached_module = look_once
 LATER = 1.1  # pytest-timeout, which names the test, comes first where it can
 STDERR = pytest.StashKey[int]()
 

@@ -1,4 +1,4 @@
-"""Demos on more ranks than subdomains: run by test_idle_ranks, not collected."""
+"""Demos on more ranks than subdomains: run by test_ranks, not collected."""
 
 import numpy as np
 import pytest

@@ -5,7 +5,7 @@ import pytest
 from bodies import drawn, held, pressed, stacked, stiffer_above, torn_boxes, two_body_problem
 from mpi4py import MPI
 from scipy.sparse import csr_array
-from test_solvable_lp import dual_of
+from test_solvability import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import FactorError

@@ -1,4 +1,4 @@
-"""Bodies with mass: identities of the step, and motions that have closed forms."""
+"""Bodies with mass: identities of the step, motions that have closed forms, and warm starts."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from dolfinx import fem
 from moving import Thrown
 from scenes import (
     accepted,
+    apart,
     clamp,
     decomposed,
     elastic,
@@ -18,12 +19,14 @@ from scenes import (
     integral,
     largest,
     measures,
+    roller,
     solved,
     vectors,
 )
 from scenes import displacement as nodal
 
 import tfeti_dolfinx as tfeti
+from demos import scene
 
 
 @pytest.mark.parametrize(("cell", "stabilised"), [("quadrilateral", False), ("tetrahedron", True)])
@@ -258,3 +261,164 @@ def test_a_light_body_gets_its_momentum_from_the_force_on_it(comm):
         change = (integral(1e-5 * above * now[1] * ufl.dx) - before) / tau
         assert change == pytest.approx(pushes[-1], rel=1e-2, abs=1e-12)
     assert max(pushes) > 1e-7
+
+
+RTOL = 1e-8
+
+
+class Driven:
+    """Sides of a mesh go down or up by what ``place`` says; nothing else moves or loads."""
+
+    def __init__(self, d, sides, contact):
+        V, u, v = vectors(d)
+        self.place, up = fem.Constant(d.mesh, 0.0), d.mesh.geometry.dim - 1
+        self.problem = tfeti.ContactDynamics(
+            elastic(u, v),
+            ufl.ZeroBaseForm((v,)),
+            [roller(V, up, d.facets(side), self.place) for side in sides],
+            [contact],
+            d,
+            mass=1.0,
+            stabilised=True,
+            petsc_options={"rtol": RTOL},
+        )
+
+    def step(self, size, place):
+        """Go on to where supports have a place; the report."""
+        self.place.value = place
+        self.problem.take_step(size)
+        accepted(self.problem)
+        return self.problem.report
+
+
+def test_a_support_may_stop_just_above_a_plane():
+    """u + τv, with what is prescribed going on as before, lies below it."""
+    plane, rough = tfeti.Plane((0, -0.1), (0, 1)), tfeti.Tresca(0.01)
+    floor = tfeti.Obstacle("bottom", plane, reach=1.0, friction=rough)
+    scene = Driven(decomposed("quadrilateral", 4, 4), ["left"], floor)
+    for n in range(1, 9):
+        report = scene.step(0.2, -0.095 * min(n / 5, 1))
+        assert report.motion["predictor"] <= RTOL * report.motion["energy"]
+        assert np.all(scene.problem.solution.remaining_gap >= -0.1 * RTOL)
+
+
+def test_a_body_that_a_support_has_not_reached_stays_where_it_is():
+    """The support stops before the gap is closed, with a velocity that would have closed it."""
+    contact = tfeti.Contact("upper bottom", "lower top", reach=1.0)
+    d = stacked("quadrilateral", 2, 3, 4, gap=0.12)
+    scene = Driven(d, ["lower bottom", "lower top"], contact)
+    V = scene.problem.u.function_space
+    above = V.tabulate_dof_coordinates()[:, 1] > 0.06
+    for place in (0.05, 0.1, 0.1, 0.1):
+        report = scene.step(0.5, place)
+        moved = scene.problem.u.x.array.reshape(-1, 2)[above]
+        assert largest(moved) <= RTOL * 0.1
+        assert report.contact_forces == [[0.0, 0.0]]
+        assert report.motion["predictor"] == pytest.approx(0.0, abs=1e-12)
+
+
+# of the first impact of the balls: 2.94 δ/V, δ = (15mV²/16E*√R)^(2/5)
+SPEED, MODULUS = np.sqrt(2 * 10.0 * 0.3), 2e4 / (1 - 0.3**2)
+HERTZ_LASTS = 2.94 * (15 * 4 / 3 * np.pi * SPEED**2 / (16 * MODULUS)) ** 0.4 / SPEED
+
+
+def bar(**options):
+    """Up to the end of the first impact, in steps of h/c."""
+    made = scene("bouncing_bar", ["--cells", 16], "ContactDynamics")
+    problem = tfeti.ContactDynamics(**{**made, "petsc_options": options})
+    return problem, 10.0 / 30.0 / 16, 64
+
+
+def ball(**options):
+    """Fifteen steps in the impact of a rough ball, cτ/H = 0.8."""
+    made = scene("falling_balls_3d", ["--balls", 1, "--gap", 0.05], "ContactDynamics")
+    problem = tfeti.ContactDynamics(**{**made, "petsc_options": options})
+    return problem, HERTZ_LASTS / 15, 18
+
+
+def multiplications(scene, cold=False, **options):
+    """Mean over the steps with contact."""
+    problem, size, steps = scene(**options)
+    problem.take_step(size)
+    counts = []
+    for _ in range(steps):
+        if cold:
+            problem._start = None
+        problem.solve()
+        problem.accept()
+        if any(np.linalg.norm(force) > 0.0 for force in problem.report.contact_forces):
+            counts.append(problem.report.F_multiplications)
+    problem.destroy()
+    assert len(counts) >= 10
+    return np.mean(counts)
+
+
+@pytest.mark.parametrize(("scene", "most", "most_cold"), [(bar, 1.0, 3.0), (ball, 8.5, 14.0)])
+def test_a_step_takes_two_thirds_of_one_that_begins_with_nothing(scene, most, most_cold):
+    """0 of 2 multiplications, with friction 8 of 14."""
+    warm, cold = multiplications(scene), multiplications(scene, cold=True, recycle=0)
+    assert warm <= 2 / 3 * cold
+    assert warm <= most
+    assert cold <= most_cold
+
+
+TIGHT = 1e-9
+
+
+class Stretched:
+    """A square that lies on a plane and is let go; its displacement at the begin is not 0."""
+
+    def __init__(self, stabilised):
+        d = decomposed("quadrilateral", 4, 4)
+        V, u, v = vectors(d)
+        self.data = {"E": fem.Constant(d.mesh, 1.0), "density": fem.Constant(d.mesh, 1.0)}
+        begin = fem.Function(V)
+        begin.interpolate(lambda x: np.stack((0.1 * x[0] ** 2, 0.2 * x[1])))
+        self.problem = tfeti.ContactDynamics(
+            self.data["E"] * elastic(u, v),
+            ufl.ZeroBaseForm((v,)),
+            [],
+            [tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))],
+            d,
+            mass=self.data["density"],
+            stabilised=stabilised,
+            u=begin,
+            petsc_options={"rtol": TIGHT},
+        )
+
+    def solve(self, step, data):
+        """Of a step from the begin: displacements and velocities of this rank."""
+        for name, value in data.items():
+            self.data[name].value = value
+        self.problem.take_step(step)
+        u = self.problem.solve().x.array.copy()
+        return np.concatenate((u, self.problem.solution.velocity.x.array))
+
+
+@pytest.mark.parametrize(
+    ("stabilised", "change"),
+    [(False, (0.4, {})), (True, (0.2, {"E": 3.0})), (False, (0.2, {"density": 0.2}))],
+)
+def test_a_step_that_is_solved_again_is_that_of_the_new_data(stabilised, change):
+    """The load of a step has 2Mw/τ² − Ku/2 in it, also where u, v and the load have stayed."""
+    scene, other = Stretched(stabilised), Stretched(stabilised)
+    first = scene.solve(0.2, {})
+    scene.problem.go_back()
+    again, anew = scene.solve(*change), other.solve(*change)
+    assert apart(first, anew) > 0.01
+    assert apart(again, anew) <= 100 * TIGHT
+
+
+def test_a_state_is_gone_on_from_with_another_density():
+    """Or with a step whose size was said before the state was taken."""
+    scene = Stretched(False)
+    scene.solve(0.2, {})
+    scene.problem.accept()
+    state = scene.problem.state()
+    anew = scene.solve(0.1, {"density": 0.5})
+    for before in (0.2, 0.1):
+        other = Stretched(False)
+        other.problem.take_step(before)
+        other.problem.restore(state)
+        found = other.solve(0.1, {"density": 0.5})
+        assert np.allclose(found, anew, rtol=0, atol=100 * TIGHT)

@@ -7,7 +7,7 @@ import pytest
 from bodies import gathered, held, pressed, stacked, two_body_problem
 from scenes import decomposed, problem
 from test_qp import matrix, random_program, vector
-from test_solvable_lp import dual_of
+from test_solvability import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.parallel import dot_over, norm_over

@@ -332,12 +332,9 @@ def test_volumes_that_do_not_fit_are_named(comm):
     for said, volumes in {"no volume 'c' .*: 'a'": "c", "expected names or tags": []}.items():
         with pytest.raises(tfeti.InputError, match=said):
             tfeti.NeoHooke(elastic, u, volumes=volumes)
-    some, all_of_it = (
-        tfeti.NeoHooke(elastic, u, volumes="a"),
-        tfeti.SaintVenantKirchhoff(elastic, u),
-    )
+    some, every = tfeti.NeoHooke(elastic, u, volumes="a"), tfeti.SaintVenantKirchhoff(elastic, u)
     residuals = {r"J: 4 cells are in no dx; .* without it are: 'b' \(2\)": some.residual(v)}
-    residuals["a SaintV.* of all volumes, and"] = some.residual(v) + all_of_it.residual(v)
+    residuals["a SaintV.* of all volumes, and"] = some.residual(v) + every.residual(v)
     for said, F in residuals.items():
         with pytest.raises(tfeti.InputError, match=said):
             tfeti.NonlinearContactProblem(F, u, [], [], cut)

@@ -17,7 +17,7 @@ from tfeti_dolfinx.io.plot import plot_deformed, plot_friction, plot_pressure
 @pytest.fixture(scope="module", params=["quadrilateral", "tetrahedron"])
 def solution(request):
     gdim = 2 if request.param == "quadrilateral" else 3
-    d = decomposed(request.param, 4, 2)  # test_idle_ranks runs it on three ranks
+    d = decomposed(request.param, 4, 2)  # test_ranks runs it on three ranks
     obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim))
     p = solved(problem(d, (0.0,) * (gdim - 1) + (-0.05,), [obstacle]))
     return p.solution

@@ -8,7 +8,7 @@ import pytest
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem, solved
-from test_solvable_lp import dual_of
+from test_solvability import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.extensions import Extensions

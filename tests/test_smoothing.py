@@ -10,7 +10,7 @@ from mpi4py import MPI
 from numpy.polynomial.chebyshev import Chebyshev
 from scenes import box, forms
 from scipy.linalg import block_diag
-from test_solvable_lp import dual_of
+from test_solvability import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.feti.preconditioner import PARAMETERS, chebyshev, smoothed

@@ -5,7 +5,7 @@ import pytest
 from bodies import held, pressed, sided, stacked, two_body_problem
 from petsc4py import PETSc
 from test_local_operators import applied, random
-from test_solvable_lp import dual_of
+from test_solvability import dual_of
 
 
 @pytest.fixture(scope="module")

@@ -165,7 +165,8 @@ def posed(
 ) -> tuple[Any, Callable[[np.ndarray], None]]:
     """Give a scene to the package; the problem, and how the scene moves."""
     gdim = scene.gdim
-    decomposition = tfeti.decompose(mesh, scene.subdomains, facet_tags=tags, surfaces=surfaces)
+    count = min(scene.subdomains, mesh.topology.index_map(mesh.topology.dim).size_global)
+    decomposition = tfeti.decompose(mesh, count, facet_tags=tags, surfaces=surfaces)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
     u = fem.Function(V, name="u")
     given: dict[str, Any] = {"petsc_options": {"rtol": RTOL}, "finite": scene.finite}

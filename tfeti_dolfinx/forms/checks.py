@@ -85,9 +85,9 @@ def check_covered(
     covered, dofs = np.zeros(len(decomposition.cell_subdomain), bool), V.dofmap.list
     covered[cells[np.isin(values, list(tags))]] = True
     left = ~covered & ~np.isin(dofs, dofs[covered]).all(axis=1)
-    of_left = decomposition.cell_tags.values[left[decomposition.cell_tags.indices]]
-    found = np.unique(np.concatenate(decomposition.comm.allgather(of_left)))
     if count := count_over(decomposition.comm, left):
+        own = np.unique(decomposition.cell_tags.values[left[decomposition.cell_tags.indices]])
+        found = np.concatenate(decomposition.comm.allgather(own))
         volumes = {n: t for n, t in decomposition.names.volumes.items() if t in found}
         raise InputError(
             f"{name}: {count} cells are in no dx; expected one over all cells, volumes without it "
