@@ -103,7 +103,7 @@ class CoarseSpace(Coarse):
         # contact does not hold bodies that move as one; nor do its rows then in G
         J = self.J
         if self.bodies.count > 1 and self.unheld.free.any() and any_rank(comm, len(rubbing) > 0):
-            self.J = J.without(self.bodies.as_one())
+            self.J = J.without(self.bodies.as_one(self.unheld))
         self.free_motions = self.unresisted(~equalities)
         self.J = J.without(self.free_motions.joint)
         both = self.free_motions.columns

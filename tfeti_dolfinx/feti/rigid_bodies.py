@@ -374,9 +374,12 @@ class Bodies:
         others = np.maximum(noise, TOLERANCES.rounding * largest.max(initial=0.0))
         self.negligible = np.maximum(TOLERANCES.balance * largest, others)
 
-    def as_one(self) -> csr_array:
-        """Return motions of all bodies as one rigid body, as columns. Collective."""
-        return csr_array(np.transpose([self.part_of(u) for u in self._subdomains.modes_as_one().T]))
+    def as_one(self, unheld: Motions) -> csr_array:
+        """Return motions of those bodies as one that are free to move, as columns. Collective."""
+        modes = self._subdomains.modes_as_one().T
+        columns = np.stack([self.part_of(u) for u in modes], axis=1)
+        columns.reshape(self.count, self.k, -1)[~unheld.free.all(axis=1)] = 0.0
+        return csr_array(columns)
 
     def part_of(self, u: Array) -> Array:
         """Coordinates of the bodies' motion in u, by least squares over the nodes. Collective."""
