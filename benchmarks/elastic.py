@@ -88,7 +88,6 @@ class Elastic:
         """J2 plasticity of these numbers, and its problem."""
         u = fem.Function(self.V)
         steel = tfeti.J2Plasticity(self.elastic, u, **law)
-        given = {"J": steel.tangent(self.u, self.v), "state": steel.state, "update": steel.update}
-        given["petsc_options"] = {"rtol": rtol}
-        residual, d = steel.residual(self.v), self.decomposition
-        return steel, tfeti.NonlinearContactProblem(residual, u, self.bcs, contacts, d, **given)
+        given, options = (u, self.bcs, contacts, self.decomposition), {"rtol": rtol}
+        F = steel.residual(self.v)
+        return steel, tfeti.NonlinearContactProblem(F, *given, petsc_options=options)

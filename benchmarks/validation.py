@@ -438,8 +438,7 @@ def taylor_bar(scale: float) -> Iterator[Row]:
         )
         plane = tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0))
         wall = tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(mu) if mu else None)
-        given = {"state": copper.state, "update": copper.update, "velocity": velocity}
-        given |= {"mass": density, "stabilised": True, "finite": True}
+        given = {"velocity": velocity, "mass": density, "stabilised": True, "finite": True}
         given |= {"thickness": scene.elastic.thickness, "petsc_options": {"rtol": 1e-4}}
         residual = copper.residual(scene.v)
         problem = tfeti.NonlinearContactDynamics(residual, u, scene.bcs, [wall], d, **given)

@@ -71,7 +71,7 @@ gmsh.finalize()
 # ## Material and contact
 
 V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (3,)))
-u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+u, v = fem.Function(V), ufl.TestFunction(V)
 elastic = tfeti.Elasticity(decomposition, E=E, nu=nu)
 steel = tfeti.J2Plasticity(elastic, u, yield_stress=strength, hardening=hardening)
 down = fem.Constant(decomposition.mesh, (0.0, 0.0, 0.0))
@@ -82,7 +82,6 @@ problem = tfeti.NonlinearContactProblem(
     [fem.dirichletbc(down, top, V)],
     [tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)), name="plane")],
     decomposition,
-    J=steel.tangent(du, v),
     stress=steel.stress,
     petsc_options={"tfeti_rtol": 1e-5},
 )

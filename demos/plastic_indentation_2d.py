@@ -83,7 +83,7 @@ decomposition = tfeti.decompose(block, 2 if arguments.quick else 4, surfaces=sur
 # +
 elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="axisymmetric")
 V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+u, v = fem.Function(V), ufl.TestFunction(V)
 steel = tfeti.J2Plasticity(elastic, u, yield_stress=strength, selective=True)
 bcs = []
 for name, k in (("axis", 0), ("bottom", 0), ("bottom", 1)):
@@ -99,7 +99,6 @@ problem = tfeti.NonlinearContactProblem(
     bcs,
     [tfeti.Obstacle("top", ball, displacement=lambda depth: (0.0, -depth), name="ball")],
     decomposition,
-    J=steel.tangent(du, v),
     stress=steel.stress,
     thickness=elastic.thickness,
     petsc_options={"tfeti_rtol": 1e-4},

@@ -133,15 +133,13 @@ def test_without_contact_it_is_dolfinx_own_solver(finite, comm):
 def plastic(comm, hardening=0.05, n=4, gdim=2, **more):
     """The block of J2 material, its problem, and the constant that moves its upper side."""
     decomposition = torn(comm, gdim, n, 0.05, 3)
-    V, u, v, du = unknowns(decomposition)
+    V, u, v, _ = unknowns(decomposition)
     model = "3d" if gdim == 3 else "plane_strain"
     elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model=model)
     law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=hardening)
     value, bc = held_top(V, decomposition)
-    F, J = law.residual(v), law.tangent(du, v)
-    more = {"petsc_options": {"rtol": 1e-8}, **more}
-    given = {"J": J, "state": law.state, "update": law.update, **more}
-    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(gdim)], decomposition, **given)
+    given, more = (u, [bc], [plane(gdim)], decomposition), {"petsc_options": {"rtol": 1e-8}, **more}
+    problem = tfeti.NonlinearContactProblem(law.residual(v), *given, **more)
     return problem, law, value
 
 
@@ -202,15 +200,14 @@ def test_stress_of_a_bar_follows_its_hardening(comm):
     """Pulled along an axis and free across: σ = σ_y(p), p = ε − σ/E, loaded and unloaded."""
     saturation, rate = 0.02, 30.0
     decomposition = decomposed("tetrahedron", 2, 3)
-    V, u, v, du = unknowns(decomposition)
+    V, u, v, _ = unknowns(decomposition)
     elastic = tfeti.Elasticity(decomposition, E=E, nu=NU)
     numbers = {"yield_stress": 0.01, "hardening": 0.05, "saturation": saturation, "rate": rate}
     law = tfeti.J2Plasticity(elastic, u, **numbers)
     pulled = fem.Constant(decomposition.mesh, 0.0)
     bcs = held(decomposition, "left", ("right", pulled), "front", "bottom")(V)
-    given = {"J": law.tangent(du, v), "state": law.state, "update": law.update}
     problem = tfeti.NonlinearContactProblem(
-        law.residual(v), u, bcs, [], decomposition, petsc_options={"rtol": 1e-10}, **given
+        law.residual(v), u, bcs, [], decomposition, petsc_options={"rtol": 1e-10}
     )
     force = fem.form(law.stress(u)[0, 0] * law.dx)
     found = {}
@@ -244,8 +241,7 @@ def test_a_stiff_body_that_yields_beside_a_soft_one_is_as_right(comm):
         for s in names:
             F -= drawn(d, f"{s} top", (0.002, -0.02 if s == "a" else -0.005))(v, measures(d)[1])
         bcs = [clamp(V, d.facets(f"{s} bottom")) for s in names]
-        more = {"state": law.state, "update": law.update, "petsc_options": {"rtol": rtol}}
-        accepted(tfeti.NonlinearContactProblem(F, u, bcs, [], d, J=law.tangent(w, v), **more))
+        accepted(tfeti.NonlinearContactProblem(F, u, bcs, [], d, petsc_options={"rtol": rtol}))
         found.append(largest(u.x.array[np.repeat(V.tabulate_dof_coordinates()[:, 0] < 1.5, 2)]))
     assert found[1] < 1e-3 * largest(u.x.array)
     assert found[1] == pytest.approx(found[0], rel=2.0 * rtol)

@@ -173,11 +173,8 @@ def test_moments_balance_on_a_flat_interface(comm):
     elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
     steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.02, hardening=0.1)
     contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.3))
-    given = {"J": steel.tangent(w, v), "state": steel.state, "update": steel.update}
-    given["petsc_options"] = {"rtol": 1e-9}
-    problem = tfeti.NonlinearContactProblem(
-        steel.residual(v), u, conditions(V), [contact], decomposition, **given
-    )
+    given, tight = (u, conditions(V), [contact], decomposition), {"rtol": 1e-9}
+    problem = tfeti.NonlinearContactProblem(steel.residual(v), *given, petsc_options=tight)
     for way.value[:] in ((0.0, -0.05), (0.03, -0.06)):
         accepted(problem)
         left, of = unbalanced(problem)

@@ -203,7 +203,6 @@ def bar(comm):
     wall = tfeti.Obstacle("left", tfeti.Plane((-0.01, 0.0), normal=(1.0, 0.0)), reach=1.0)
     left = field(V, lambda x: np.array([-0.1 + 0 * x[0], 0 * x[0]]))
     given = {"mass": 1.0, "velocity": left, "stabilised": True, "petsc_options": {"rtol": 1e-9}}
-    given |= {"J": steel.tangent(du, v), "state": steel.state, "update": steel.update}
     F = steel.residual(v)
     return tfeti.NonlinearContactDynamics(F, u, [], [wall], d, **given), steel
 

@@ -358,17 +358,16 @@ def nonlinear(finite, tool, friction=None):
     """Problem of a tool on a block: J2 in small strain, neo-Hooke in finite strain."""
     decomposition = decomposed("triangle", 6, 4)
     V, du, v = vectors(decomposition)
-    u, state = fem.Function(V), {}
+    u = fem.Function(V)
     if finite:
         residual = ufl.derivative(neo_hooke(u, 1.0, 0.3) * DX, u, v)
     else:
         elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
         steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.05, hardening=0.1)
         residual = steel.residual(v)
-        state = {"state": steel.state, "update": steel.update, "J": steel.tangent(du, v)}
     bcs = [clamp(V, decomposition.facets("bottom"))]
     contacts = [tfeti.Obstacle("top", tool, friction=friction)]
-    given = {"finite": finite, "petsc_options": {"rtol": 1e-9}, **state}
+    given = {"finite": finite, "petsc_options": {"rtol": 1e-9}}
     return tfeti.NonlinearContactProblem(residual, u, bcs, contacts, decomposition, **given)
 
 

@@ -52,9 +52,8 @@ def ours(points, cells):
         scene.hold("axis", 0)
         law = tfeti.NeoHooke(scene.elastic, u, degree=2)
         plane = tfeti.Obstacle("arc", tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0)))
-        given = {"finite": True, "update": law.update}
         residual = law.residual(scene.v)
-        problem = tfeti.NonlinearContactProblem(residual, u, scene.bcs, [plane], d, **given)
+        problem = tfeti.NonlinearContactProblem(residual, u, scene.bcs, [plane], d, finite=True)
         steps = 0
         for depth in DEPTHS:
             down.value = -depth

@@ -225,12 +225,12 @@ class Material(ABC):
         return stress if self._inside is None else self._inside * stress
 
 
-def laws_of(forms: Sequence[ufl.Form], update: Any, u: fem.Function) -> list[Material]:
-    """Return the laws of u in forms, and the one whose method ``update`` is.
+def laws_of(F: ufl.Form, update: Any, u: fem.Function) -> list[Material]:
+    """Return the laws of u in a residual, and the one whose method ``update`` is.
 
     Raise an InputError where that is of another displacement, or volumes are not told apart.
     """
-    found = [getattr(f, "law", None) for form in forms for f in form.coefficients()]
+    found = [getattr(f, "law", None) for f in F.coefficients()]
     laws = dict.fromkeys(law for law in found if isinstance(law, Material) and law.u is u)
     if isinstance(law := getattr(update, "__self__", None), Material):
         if law.u is not u:
@@ -391,13 +391,19 @@ class J2Plasticity(Plasticity):
 
     def tangent(self, w: Any, v: Any) -> ufl.Form:
         """Return the derivative of ``residual`` along w, consistent with the return."""
-        e, mu, q, n = self.elasticity.strain(w), self.elasticity.mu, self._norm(self.u), self._n
-        plastic = ufl.conditional(ufl.gt(self._dp, 0.0), 1.0, 0.0)
-        share = 1 - 3 * mu * self._dp / q
-        along = 4 * mu**2 * plastic * (1 / (3 * mu + self._slope) - self._dp / q)
-        deviator = 2 * mu * share * ufl.dev(e) - along * ufl.inner(n, e) * n
-        deviator += 2 * mu * self.regularisation * plastic * ufl.dev(e)
-        return self._integrated(ufl.tr(e), deviator, self.elasticity.strain(v))
+        F = self.residual(v)
+        return ufl.derivative(F, self.u, w) + self.of_update(F, w, v)
+
+    def of_update(self, F: ufl.Form, w: Any, v: Any) -> ufl.Form:
+        """Return the derivative along w of a residual as ``update`` returns stresses.
+
+        And what is for tangents alone, where there is no hardening.
+        """
+        e, mu = self.elasticity.strain(w), self.elasticity.mu
+        plastic = ufl.conditional(ufl.gt(self._dp, 0.0), 2 * mu, 0.0)
+        increment = plastic * ufl.inner(self._n, e) / (3 * mu + self._slope)
+        more = self.regularisation * plastic * ufl.inner(ufl.dev(e), self.elasticity.strain(v))
+        return ufl.derivative(F, self._dp, increment) + self.elasticity.thickness * more * self.dx
 
     def _deviator(self, u: Any) -> Any:
         """Deviatoric stress, returned by what ``update`` has found."""
@@ -425,6 +431,14 @@ class J2Plasticity(Plasticity):
         volume = self.elasticity.thickness * self._bulk * dilatation * ufl.tr(strain)
         shape = self.elasticity.thickness * ufl.inner(deviator, strain)
         return volume * self._at.dx_volume + shape * self.dx
+
+
+def derivative_of(F: ufl.Form, u: fem.Function, laws: Sequence[Material]) -> ufl.Form:
+    """Return the derivative of a residual as ``update`` of its laws returns stresses."""
+    J = ufl.derivative(F, u)
+    v, w = J.arguments()
+    of_laws = [law.of_update(F, w, v) for law in laws if isinstance(law, J2Plasticity)]
+    return sum(of_laws, J)
 
 
 def check_law(elasticity: Any, u: Any, name: str) -> None:

@@ -25,7 +25,7 @@ from tfeti_dolfinx.errors import (
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms, rotation_free_tangent
-from tfeti_dolfinx.nonlinear.materials import laws_of
+from tfeti_dolfinx.nonlinear.materials import derivative_of, laws_of
 from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonTolerances
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.problem import ContactProblem
@@ -66,10 +66,11 @@ class NonlinearContactProblem(ContactProblem):
         bcs: Dirichlet conditions on the displacement.
         contacts: Obstacles and pairs of surfaces.
         decomposition: The torn mesh.
-        J: Derivative of F, a symmetric bilinear form; default ``ufl.derivative(F, u)``.
+        J: Derivative of F, a symmetric bilinear form; default ``ufl.derivative(F, u)``, with what
+            ready laws add as their stresses follow u.
         state: Internal variables: for each function what gives its value at the end of a load
             step, see ``InternalVariables``. They are committed by ``accept``. Those of ready laws
-            in F or J need not be given.
+            in F need not be given.
         update: Called without arguments when ``u`` has changed, before a form is assembled: for
             functions in F and J that depend on u. Those of ready laws are set after it.
         finite: Whether strains and displacements are finite: F is integrated on the mesh as it
@@ -129,12 +130,12 @@ class NonlinearContactProblem(ContactProblem):
                         f"{contact.name}: a given gap with finite=True; "
                         'expected gap="geometry" or "curved"'
                     )
+            laws, self._has_own_tangent = laws_of(F, update, u), J is not None
             if finite:
                 J = rotation_free_tangent(F, u)
             elif J is None:
-                J = ufl.derivative(F, u)
+                J = derivative_of(F, u, laws)
             checked_type(J, ufl.Form, "J", "a bilinear form")
-            laws = laws_of((F, J), update, u)
             state = {} if state is None else state
             checked_type(state, Mapping, "state", "a dictionary from functions to their new values")
             of_laws = [item for law in laws for item in law.state.items() if item[0] not in state]
@@ -167,7 +168,6 @@ class NonlinearContactProblem(ContactProblem):
         self._last_increment = self._loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
         self._diagnostics.finite = self._finite
-        self._has_own_tangent = J is not None and not finite
         if finite:
             self._check_rotations()
 
