@@ -375,8 +375,10 @@ class Bodies:
         self.negligible = np.maximum(TOLERANCES.balance * largest, others)
 
     def as_one(self) -> csr_array:
-        """Return motions of all bodies as one rigid body, as columns. Collective."""
-        return csr_array(np.transpose([self.part_of(u) for u in self._subdomains.modes_as_one().T]))
+        """Return motions of all bodies as one rigid body, orthonormal columns. Collective."""
+        parts = [self.part_of(u) for u in self._subdomains.modes_as_one().T]
+        # far from the origin a turn about it is a translation but for a little
+        return orthonormal_columns(csr_array(np.transpose(parts)))
 
     def part_of(self, u: Array) -> Array:
         """Coordinates of the bodies' motion in u, by least squares over the nodes. Collective."""
