@@ -38,9 +38,10 @@ class MotionTolerances:
     # size of a row on motions of bodies, over its own, below which it only glues
     gluing: float = 1e-6
     no_grip: float = 1e-12  # the same of an entry of another row that is only rounding
-    # of a row, what it sees of bodies that turn as one: friction acts on sides that are apart by so
-    # little of the bodies' size, by rounding, curved facets or what a step of Newton's is off
-    as_one: float = 1e-3
+    # of a row between bodies, what it sees of them as one, how far its sides are apart over
+    # their size: by gaps, what a step of Newton's is off, or curved facets, 0.008 on eight chords.
+    # Stresses are off by about as much. What holds a row's body in space is most of a row
+    as_one: float = 0.1
     # of the largest coefficient of a motion: a body that moves by less takes no part
     takes_part: float = 1e-3
     # a motion is named after modes of this share or more, which leaves out what a rotation about
