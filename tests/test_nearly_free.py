@@ -106,10 +106,14 @@ def test_a_ring_that_has_borne_no_force_sticks_before_it_slips():
         assert p.report.F_multiplications <= 25
 
 
-@pytest.mark.parametrize(("cells", "degree"), [((16, 20), 2), ((17, 33), 2), ((40, 30), 1)])
-def test_a_fit_that_nothing_holds_in_space_is_right_with_friction(cells, degree):
+@pytest.mark.parametrize(
+    ("cells", "degree", "away"),
+    [((16, 20), 2, 0.0), ((17, 33), 2, 0.0), ((40, 30), 1, 1e4), ((16, 20), 1, 0.0)],
+)
+def test_a_fit_that_nothing_holds_in_space_is_right_with_friction(cells, degree, away):
     """Sides of friction are apart by curved facets; that does not hold both rings as one."""
     d = shrunk(MPI.COMM_WORLD, cells, degree)
+    d.mesh.geometry.x[:, :2] += away
     fit = tfeti.Contact("shaft", "hub", gap=-0.01, friction=tfeti.Coulomb(0.5))
     p = solved(two_body_problem(d, no_load, lambda V: [], [fit], degree, rtol=1e-8))
     contact = p.solution.contact(0)
@@ -117,6 +121,15 @@ def test_a_fit_that_nothing_holds_in_space_is_right_with_friction(cells, degree)
     assert pressure == pytest.approx(lame_pressure(0.01), rel=0.03)
     assert p.report.F_multiplications <= 50
     assert p.report.free_modes == 3
+
+
+def test_a_torque_on_a_fit_that_floats_is_named():
+    d, rough = shrunk(MPI.COMM_WORLD, (16, 20)), {"friction": tfeti.Coulomb(0.5)}
+    x, y = ufl.SpatialCoordinate(d.mesh)
+    fits = [tfeti.Contact("shaft", "hub", gap=-0.01, **rough)]
+    way, rim = 1e-5 * ufl.as_vector((-y, x)), d.surface("rim")
+    with pytest.raises(tfeti.NoSolutionError, match=r"together \(rotation"):
+        two_body_problem(d, lambda v, ds: ufl.dot(way, v) * ds(rim), lambda V: [], fits).solve()
 
 
 def test_fits_are_released_beside_one_that_stays():

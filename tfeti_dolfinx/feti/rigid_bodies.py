@@ -38,9 +38,10 @@ class MotionTolerances:
     # size of a row on motions of bodies, over its own, below which it only glues
     gluing: float = 1e-6
     no_grip: float = 1e-12  # the same of an entry of another row that is only rounding
-    # of a row, what it sees of bodies that turn as one: friction acts on sides that are apart by so
-    # little of the bodies' size, by rounding, curved facets or what a step of Newton's is off
-    as_one: float = 1e-3
+    # of a row between bodies, what it sees of them as one, how far its sides are apart over
+    # their size: by gaps, what a step of Newton's is off, or curved facets, 0.008 on eight chords.
+    # Stresses are off by about as much. What holds a row's body in space is most of a row
+    as_one: float = 0.1
     # of the largest coefficient of a motion: a body that moves by less takes no part
     takes_part: float = 1e-3
     # a motion is named after modes of this share or more, which leaves out what a rotation about
@@ -375,11 +376,12 @@ class Bodies:
         self.negligible = np.maximum(TOLERANCES.balance * largest, others)
 
     def as_one(self, unheld: Motions) -> csr_array:
-        """Return motions of those bodies as one that are free to move, as columns. Collective."""
-        modes = self._subdomains.modes_as_one().T
-        columns = np.stack([self.part_of(u) for u in modes], axis=1)
-        columns.reshape(self.count, self.k, -1)[~unheld.free.all(axis=1)] = 0.0
-        return csr_array(columns)
+        """Return motions of those bodies as one that are free to move, orthonormal. Collective."""
+        parts = np.stack([self.part_of(u) for u in self._subdomains.modes_as_one().T], axis=1)
+        parts.reshape(self.count, self.k, -1)[~unheld.free.all(axis=1)] = 0.0
+        # far from the origin a turn about it is a translation but for a little
+        columns, sizes, _ = np.linalg.svd(parts, full_matrices=False)
+        return csr_array(columns[:, sizes > TOLERANCES.dependent * sizes.max(initial=0.0)])
 
     def part_of(self, u: Array) -> Array:
         """Coordinates of the bodies' motion in u, by least squares over the nodes. Collective."""
