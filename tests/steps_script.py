@@ -141,8 +141,11 @@ def solve(folder, how):
 
 
 if __name__ == "__main__":
+    how = ""
     for word in sys.argv[1:]:  # how the folders after it are run, or a folder
         if Path(word).is_absolute():
-            solve(Path(word), how)  # noqa: F821
-        elif (how := word) in DEATHS:
+            solve(Path(word), how)
+            continue
+        how = word
+        if how in DEATHS:
             die_at(*DEATHS[how])

@@ -117,7 +117,9 @@ def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float, unseen: 
                 sigma, V = right_singular(MPI.COMM_SELF, dense)
                 V = V[sigma > unseen * sigma.max(initial=0.0)]
                 seen = dense @ V.T @ V
-                motion[part] = least_distance(seen, g[at], wanted[part])
+                near = least_distance(seen, g[at], wanted[part])
+                # once more: what is left is rounding of a way that may be long beside gaps
+                motion[part] = least_distance(seen, g[at], near)
                 by[at] = seen @ motion[part]
             closed = np.split(by, np.cumsum([len(gap) for gap in gaps])[:-1])
     alpha = coarse.motions @ np.asarray(N @ bcast_from_root(comm, motion))

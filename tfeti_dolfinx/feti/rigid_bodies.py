@@ -40,7 +40,7 @@ class MotionTolerances:
     no_grip: float = 1e-12  # the same of an entry of another row that is only rounding
     # of a row between bodies, what it sees of them as one, how far its sides are apart over
     # their size: by gaps, what a step of Newton's is off, or curved facets, 0.008 on eight chords.
-    # Stresses are off by about as much. What holds a row's body in space is most of a row
+    # Stresses are off by less than that. What holds a row's body in space is most of a row
     as_one: float = 0.1
     # of the largest coefficient of a motion: a body that moves by less takes no part
     takes_part: float = 1e-3
