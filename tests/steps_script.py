@@ -143,9 +143,9 @@ def solve(folder, how):
 if __name__ == "__main__":
     how = ""
     for word in sys.argv[1:]:  # how the folders after it are run, or a folder
-        if Path(word).is_absolute():
-            solve(Path(word), how)
+        if not Path(word).is_absolute():
+            how = word
             continue
-        how = word
         if how in DEATHS:
             die_at(*DEATHS[how])
+        solve(Path(word), how)

@@ -8,7 +8,7 @@ from bodies import clamped, drawn, joined, no_load, torn_boxes, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import bumpy, decomposed, exterior, problem, solved
+from scenes import accepted, bumpy, decomposed, exterior, problem, solved
 from true_errors import ring_problem
 
 import tfeti_dolfinx as tfeti
@@ -130,6 +130,18 @@ def test_a_torque_on_a_fit_that_floats_is_named():
     way, rim = 1e-5 * ufl.as_vector((-y, x)), d.surface("rim")
     with pytest.raises(tfeti.NoSolutionError, match=r"together \(rotation"):
         two_body_problem(d, lambda v, ds: ufl.dot(way, v) * ds(rim), lambda V: [], fits).solve()
+
+
+@pytest.mark.parametrize("law", [None, tfeti.Coulomb(0.2)])
+def test_a_fit_is_taken_to_nothing_and_back(law):
+    d, pressures = shrunk(MPI.COMM_WORLD, (16, 20), 2), []
+    fit = tfeti.Contact("shaft", "hub", gap=-0.005, friction=law)
+    p = two_body_problem(d, no_load, clamped(d, "bore"), [fit], 2)
+    for gap in (-0.01, 0.0, 0.0, -0.01, 0.0):
+        p.update(gap={0: gap})
+        pressures.append(accepted(p).contact().pressure)
+    assert pressures[3] == pytest.approx(pressures[0], rel=1e-3)
+    assert max(pressures[1], pressures[2], pressures[4]) < 1e-6 * pressures[0]
 
 
 def test_fits_are_released_beside_one_that_stays():
