@@ -18,6 +18,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
+from tfeti_dolfinx.mortar.facets import create_element
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
@@ -35,7 +36,7 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     cell = getattr(basix.CellType, cell_type.name)
     corners = geometry_dofmap(mesh)[:, : len(cell_entities(cell_type, 0))]
     gdim = mesh.geometry.dim
-    element = basix.create_element(basix.ElementFamily.P, cell, 1)
+    element = create_element(basix.ElementFamily.P, cell, 1)
     middle = basix.geometry(cell).mean(axis=0)[None]
     slopes = element.tabulate(1, middle)[1:, 0, :, 0]
     J = np.moveaxis(mesh.geometry.x.T[:gdim, corners] @ slopes.T, 2, 1).copy()  # cells come last

@@ -17,6 +17,8 @@ Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
+# multiplications that take as long as a call of PETSc, and as to make two dense matrices of it
+CALL, DENSE = 2_000, 30_000
 EPSILON = float(np.finfo(float).eps)  # relative rounding of a number
 
 
@@ -148,8 +150,9 @@ class LocalMatrix:
     ``count`` is the number of its entries.
     """
 
-    def __init__(self, A: csr_array | Entries) -> None:
-        self.shape, self.count, self._petsc = A.shape, len(A.data), as_petsc_matrix(A)
+    def __init__(self, A: csr_array | Entries | PETSc.Mat) -> None:
+        self._petsc = A if isinstance(A, PETSc.Mat) else as_petsc_matrix(A)
+        self.shape, self.count = self._petsc.getSize(), int(self._petsc.getInfo()["nz_used"])
         # sums are those of scipy to the last bit, and so the same in any number of columns
         self._petsc.setOption(PETSc.Mat.Option.USE_INODES, False)
         self._x, self._y = self._petsc.createVecs()
@@ -157,7 +160,7 @@ class LocalMatrix:
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
         if x.ndim > 1:
-            return of_columns(self._petsc.matMult, x, self.shape[0])
+            return self._of_columns(self.__matmul__, self._petsc.matMult, x, self.shape[0])
         self._x.setArray(x)
         self._petsc.mult(self._x, self._y)
         return np.array(self._y.array_r)
@@ -165,10 +168,34 @@ class LocalMatrix:
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""
         if y.ndim > 1:
-            return of_columns(self._petsc.transposeMatMult, y, self.shape[1])
+            many = self._petsc.transposeMatMult
+            return self._of_columns(self.transposed, many, y, self.shape[1])
         self._y.setArray(y)
         self._petsc.multTranspose(self._y, self._x)
         return np.array(self._x.array_r)
+
+    def _of_columns(
+        self,
+        one: Callable[[Array], Array],
+        many: Callable[[PETSc.Mat], PETSc.Mat],
+        x: Array,
+        rows: int,
+    ) -> Array:
+        """Return products with few columns of a small matrix one by one, else at once."""
+        if 0 < (CALL + self.count) * x.shape[1] < DENSE:
+            return np.array([one(column) for column in x.T]).T
+        return of_columns(many, x, rows)
+
+    def part(self, rows: Array, columns: Array) -> PETSc.Mat:
+        """Return A[rows][:, columns]."""
+        sets = [
+            PETSc.IS().createGeneral(places.astype(PETSc.IntType, copy=False), PETSc.COMM_SELF)
+            for places in (rows, columns)
+        ]
+        made = self._petsc.createSubMatrix(*sets)
+        for item in sets:
+            item.destroy()
+        return made
 
     def is_symmetric(self, tolerance: float) -> bool:
         """Return whether entries of A − Aᵀ are at most this large."""
@@ -176,8 +203,13 @@ class LocalMatrix:
 
     def entries(self) -> Entries:
         """Return copies of its arrays."""
-        indptr, indices, data = self._petsc.getValuesCSR()
-        return Entries(data, indices, indptr, self.shape)
+        return entries_of(self._petsc)
+
+
+def entries_of(A: PETSc.Mat) -> Entries:
+    """Return copies of the arrays of a matrix of PETSc on one rank."""
+    indptr, indices, data = A.getValuesCSR()
+    return Entries(data, indices, indptr, A.getSize())
 
 
 def of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array, rows: int) -> Array:

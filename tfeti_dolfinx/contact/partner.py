@@ -23,6 +23,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
+    FacetKind,
     Facets,
     diameter,
     facet_kind,
@@ -255,15 +256,18 @@ class Obstacle(ContactPartner):
 
         At the first search the shape has to fit: later the surface may have turned away from it.
         """
+        kind, facets = self._facets(dofs)
         # of a scalar space the gradient's first component counts
         if stiffness is not None and dofs.bs > 1:
-            self._check_shape(dofs)
-        return super().settled(dofs, contact, reach, stiffness, flag)
+            self._check_shape(dofs, facets)
+        return self, self._met(dofs, contact, reach, kind, facets, flag)
 
-    def _check_shape(self, dofs: TornDofs) -> None:
+    def _facets(self, dofs: TornDofs) -> tuple[FacetKind, Facets]:
+        kind = facet_kind(dofs)
+        return kind, local_facets(dofs, dofs.decomposition.facets(self.surface), kind)
+
+    def _check_shape(self, dofs: TornDofs, facets: Facets) -> None:
         """Raise an InputError unless the gradient is the distance's and a facet faces the shape."""
-        surface = surface_facets(dofs.decomposition, self.surface)
-        facets = local_facets(dofs, surface, facet_kind(dofs))
         centres, size = facets.corners.mean(axis=1), diameter(dofs.decomposition)
         check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
@@ -283,8 +287,18 @@ class Obstacle(ContactPartner):
         given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
         n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
-        kind = facet_kind(dofs)
-        facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface), kind)
+        return self._met(dofs, contact, reach, *self._facets(dofs), flag)
+
+    def _met(
+        self,
+        dofs: TornDofs,
+        contact: int,
+        reach: float,
+        kind: FacetKind,
+        facets: Facets,
+        flag: Flag,
+    ) -> ContactRecords:
+        """Return the conditions of ``records`` from its facets. Collective."""
         corners = facets.corners
         with raised_on_all_ranks(dofs.comm):
             distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)

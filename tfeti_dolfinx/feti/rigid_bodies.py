@@ -483,8 +483,8 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
         first.append(np.linalg.solve(M[chosen], X.parts[own[chosen]]))
         left[own] -= M @ first[-1]
     pinned = np.concatenate(pins)
-    others = np.setdiff1d(np.arange(len(left)), pinned)
-    rest = np.setdiff1d(np.arange(X.shape[0]), X.row[pinned])
+    others = np.delete(np.arange(len(left)), pinned)
+    rest = np.delete(np.arange(X.shape[0]), X.row[pinned])
     coordinates = BodyRows(
         np.append(np.arange(len(pinned)), len(pinned) + np.searchsorted(rest, X.row[others])),
         X.body[np.append(pinned, others)],

@@ -188,7 +188,13 @@ class TornDofs:
 
         ``op`` is as in ``reduce``, ``initial`` its neutral element. Collective.
         """
-        exchange, slot = self.owners_of(groups)
+        return self.reduced(self.owners_of(groups), values, op, initial)
+
+    def reduced(
+        self, owners: tuple[Exchange, Array], values: Array, op: np.ufunc = np.add, initial: Any = 0
+    ) -> Array:
+        """Do the same for groups whose ``owners_of`` are known. Collective."""
+        exchange, slot = owners
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
         op.at(out, slot, exchange.send(values))
         return out
