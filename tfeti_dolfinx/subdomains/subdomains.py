@@ -289,9 +289,10 @@ def _assembled(parts: Sequence[Array], first: Sequence[int] | Array, width: int)
     """Dense parts one below the other as a sparse matrix, with the first column of each."""
     rows, columns = np.array([p.shape for p in parts], dtype=np.int64).reshape(-1, 2).T
     table = np.concatenate(([0], np.cumsum(np.repeat(columns, rows))))
-    indices = [np.tile(a + np.arange(q), n) for a, n, q in zip(first, rows, columns, strict=True)]
+    pairs = zip(parts, first, strict=True)
+    indices = joined([np.tile(a + np.arange(p.shape[1]), len(p)) for p, a in pairs])
     data = joined([p.ravel() for p in parts])
-    return csr_array((data, joined(indices).astype(np.int64), table), shape=(rows.sum(), width))
+    return csr_array((data, indices.astype(np.int64), table), shape=(rows.sum(), width))
 
 
 # --- From the forms to the Blocks -------------------------------------------------------------
