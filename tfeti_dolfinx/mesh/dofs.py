@@ -151,15 +151,15 @@ class TornDofs:
     def points(self) -> Array:
         """Return the place of each primal node, shape ``(n, 3)``."""
         x = self.V.tabulate_dof_coordinates() if self.nodes is None else self.nodes
-        return np.asarray(x[self.dolfinx_node])
+        return np.asarray(x.take(self.dolfinx_node, axis=0))
 
     def to_primal(self, values: Array) -> Array:
         """Unrolled dof values from DOLFINx's order to primal order, shape ``(n * bs,)``."""
-        return values.reshape(-1, self.bs)[self.dolfinx_node].ravel()
+        return values.reshape(-1, self.bs).take(self.dolfinx_node, axis=0).ravel()
 
     def to_dolfinx(self, values: Array) -> Array:
         """Unrolled dof values from primal order to DOLFINx's order, shape ``(n * bs,)``."""
-        return values.reshape(-1, self.bs)[self.primal_node].ravel()
+        return values.reshape(-1, self.bs).take(self.primal_node, axis=0).ravel()
 
     def dolfinx_dofs(self) -> Array:
         """DOLFINx's unrolled dof for each primal dof, shape ``(n * bs,)``."""
@@ -174,12 +174,12 @@ class TornDofs:
 
     def spread(self, values: Array) -> Array:
         """Give every copy its group's value: shape ``(g, ...)`` to ``(n, ...)``. Collective."""
-        return self._to_owner.answer(values[self._to_owner_slot])
+        return self._to_owner.answer(values.take(self._to_owner_slot, axis=0))
 
     def lookup(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
         """Rows for any groups, ``(k,)``, of tables with a row per owned group. Collective."""
         exchange, asked = self.owners_of(groups)
-        return tuple(exchange.answer(table[asked]) for table in tables)
+        return tuple(exchange.answer(table.take(asked, axis=0)) for table in tables)
 
     def reduce_on_owners(
         self, groups: Array, values: Array, op: np.ufunc = np.add, initial: Any = 0
@@ -228,7 +228,7 @@ class TornDofs:
 
     def gather_copies(self, values: Array) -> Array:
         """Give values of nodes, ``(n, ...)``, to the owned ``copies``, ``(c, ...)``. Collective."""
-        return self._to_owner.send(values)[self._copy_order]
+        return self._to_owner.send(values).take(self._copy_order, axis=0)
 
     def lookup_copies(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
         """Find all copies of groups, ``(k,)``, and their rows of tables. Collective.

@@ -271,7 +271,7 @@ class Subdomains:
         u, found = np.array(displacements), np.zeros((len(self.blocks), len(displacements)))
         for at, (block, part) in enumerate(self.block_parts):
             nodes = u[:, part].reshape(len(u), -1, block.bs)
-            found[at] = np.einsum("qni,qni->qn", nodes, nodes).max(axis=1, initial=0.0)
+            found[at] = sum(np.moveaxis(nodes**2, 2, 0)).max(axis=1, initial=0.0)
         return self.of_bodies(np.sqrt(found).T, largest=True)
 
     def _on_bodies(
