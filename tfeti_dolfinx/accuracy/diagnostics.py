@@ -114,18 +114,25 @@ class Diagnostics:
         self._lasting: list[str] = []
         self._slopes: list[Array] = []
 
-    def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
-        """Sentences beside the ``outcome``, each of which names the thing. Collective."""
+    def found(
+        self, dual: Dual, solution: Solution, outcome: Outcome, energy: Array, rtol: float
+    ) -> list[str]:
+        """Sentences beside the ``outcome``, each of which names the thing. Collective.
+
+        ``energy`` is uᵀKu of each body.
+        """
         if self._of is None or self._of() is not dual:
             nodes = self._points(dual.subdomains)
             lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             # mean slopes of a displacement of each subdomain, (gdim, nodes)
-            self._slopes = [np.linalg.pinv(own, EPSILON * len(own)) for own in nodes]
+            self._slopes = [
+                np.linalg.pinv(x.T @ x, EPSILON * len(x), hermitian=True) @ x.T for x in nodes
+            ]
         u = solution.u
         return [
             *_loose(outcome),
-            *self._rounding(dual, u, rtol),
+            *self._rounding(dual, u, energy, rtol),
             *self._turned(u, dual.subdomains),
             *self._facets(solution, dual.subdomains),
             *self._lasting,
@@ -172,7 +179,7 @@ class Diagnostics:
                 "it too stiff (locking) unless its law is selective; expected degree 2"
             )
 
-    def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
+    def _rounding(self, dual: Dual, u: Array, energy: Array, rtol: float) -> Iterator[str]:
         """Warn of slender bodies, whose small bending energy is inexact by the rounding of K.
 
         That of uᵀKu is about ε uᵀDu, D the diagonal, of u less the rigid motion of the body.
@@ -183,7 +190,7 @@ class Diagnostics:
         diagonal = joined([block.diagonal for block in subdomains.blocks])
         parts = subdomains.dof_parts
         squares = [sums(diagonal * of**2, parts) for of in (bent, u)]
-        energy, terms, moved = subdomains.of_bodies([subdomains.energies(u), *squares])
+        terms, moved = subdomains.of_bodies(squares)
         # that of a body which only moves is rounding
         known = energy > EPSILON * np.maximum(energy, EPSILON * moved).max(initial=0.0)
         share = (
