@@ -117,10 +117,7 @@ class Diagnostics:
     def found(
         self, dual: Dual, solution: Solution, outcome: Outcome, energy: Array, rtol: float
     ) -> list[str]:
-        """Sentences beside the ``outcome``, each of which names the thing. Collective.
-
-        ``energy`` is uᵀKu of each body.
-        """
+        """Sentences, each of which names the thing, from uᵀKu of each body, too. Collective."""
         if self._of is None or self._of() is not dual:
             nodes = self._points(dual.subdomains)
             lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)

@@ -91,16 +91,14 @@ def transposed(A: Any) -> Entries:
     return entries_at(A.indices, row, A.data, A.shape[::-1])
 
 
-def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
-    """Return A[rows][:, columns] of a CSR matrix, columns ascending."""
-    rows = np.arange(A.shape[0])[rows]
+def columns_of(A: Any, columns: Array) -> Entries:
+    """Return A[:, columns] of a CSR matrix, columns ascending."""
     place = np.full(A.shape[1], -1, dtype=A.indices.dtype)
     place[columns] = np.arange(len(columns))
-    entries, table = entries_of_rows(A, rows)
-    column = place[A.indices[entries]]
+    column = place[A.indices]
     kept = column >= 0
-    table = np.concatenate(([0], np.cumsum(kept)))[table]
-    return Entries(A.data[entries[kept]], column[kept], table, (len(rows), len(columns)))
+    table = np.concatenate(([0], np.cumsum(kept)))[A.indptr]
+    return Entries(A.data[kept], column[kept], table, (A.shape[0], len(columns)))
 
 
 def plus(A: Any, row: Array, column: Array, value: Array) -> Entries:
@@ -159,43 +157,35 @@ class LocalMatrix:
 
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
+        if x.ndim > 1 and self._is_little(x):
+            return np.array([self @ column for column in x.T]).T
         if x.ndim > 1:
-            return self._of_columns(self.__matmul__, self._petsc.matMult, x, self.shape[0])
+            return of_columns(self._petsc.matMult, x, self.shape[0])
         self._x.setArray(x)
         self._petsc.mult(self._x, self._y)
         return np.array(self._y.array_r)
 
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""
+        if y.ndim > 1 and self._is_little(y):
+            return np.array([self.transposed(column) for column in y.T]).T
         if y.ndim > 1:
-            many = self._petsc.transposeMatMult
-            return self._of_columns(self.transposed, many, y, self.shape[1])
+            return of_columns(self._petsc.transposeMatMult, y, self.shape[1])
         self._y.setArray(y)
         self._petsc.multTranspose(self._y, self._x)
         return np.array(self._x.array_r)
 
-    def _of_columns(
-        self,
-        one: Callable[[Array], Array],
-        many: Callable[[PETSc.Mat], PETSc.Mat],
-        x: Array,
-        rows: int,
-    ) -> Array:
-        """Return products with few columns of a small matrix one by one, else at once."""
-        if 0 < (CALL + self.count) * x.shape[1] < DENSE:
-            return np.array([one(column) for column in x.T]).T
-        return of_columns(many, x, rows)
+    def _is_little(self, x: Array) -> bool:
+        """Return whether products with columns, not none, take less time one by one."""
+        return 0 < (CALL + self.count) * x.shape[1] < DENSE
 
     def part(self, rows: Array, columns: Array) -> PETSc.Mat:
         """Return A[rows][:, columns]."""
         sets = [
-            PETSc.IS().createGeneral(places.astype(PETSc.IntType, copy=False), PETSc.COMM_SELF)
+            PETSc.IS().createGeneral(places.astype(PETSc.IntType), PETSc.COMM_SELF)
             for places in (rows, columns)
         ]
-        made = self._petsc.createSubMatrix(*sets)
-        for item in sets:
-            item.destroy()
-        return made
+        return self._petsc.createSubMatrix(*sets)
 
     def is_symmetric(self, tolerance: float) -> bool:
         """Return whether entries of A − Aᵀ are at most this large."""
@@ -203,13 +193,8 @@ class LocalMatrix:
 
     def entries(self) -> Entries:
         """Return copies of its arrays."""
-        return entries_of(self._petsc)
-
-
-def entries_of(A: PETSc.Mat) -> Entries:
-    """Return copies of the arrays of a matrix of PETSc on one rank."""
-    indptr, indices, data = A.getValuesCSR()
-    return Entries(data, indices, indptr, A.getSize())
+        indptr, indices, data = self._petsc.getValuesCSR()
+        return Entries(data, indices, indptr, self.shape)
 
 
 def of_columns(product: Callable[[PETSc.Mat], PETSc.Mat], x: Array, rows: int) -> Array:

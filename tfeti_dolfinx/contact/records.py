@@ -10,8 +10,8 @@ from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
-from tfeti_dolfinx.common.parallel import Exchange, any_rank, largest, summed
-from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.common.parallel import any_rank, largest, summed
+from tfeti_dolfinx.mesh.dofs import Owners, TornDofs
 from tfeti_dolfinx.mortar.facets import Facets, hat_integrals
 from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals, Triplets
 from tfeti_dolfinx.mortar.segments import frames
@@ -197,12 +197,7 @@ def conditions(
 
 
 def _mean_gaps(
-    dofs: TornDofs,
-    owners: tuple[Exchange, Array],
-    gap: GapIntegrals,
-    area: Array,
-    chosen: Array,
-    rounding: float,
+    dofs: TornDofs, owners: Owners, gap: GapIntegrals, area: Array, chosen: Array, rounding: float
 ) -> tuple[Array, Array]:
     """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
 

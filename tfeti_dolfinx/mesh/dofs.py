@@ -16,6 +16,9 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.untorn import cell_entities, exchange_by_key, mix, set_key
 
+# the exchange with the owners of groups, and which of theirs each row asks
+Owners = tuple[Exchange, Array]
+
 # --- Function spaces on a torn mesh -----------------------------------------------------------
 
 
@@ -191,7 +194,7 @@ class TornDofs:
         return self.reduced(self.owners_of(groups), values, op, initial)
 
     def reduced(
-        self, owners: tuple[Exchange, Array], values: Array, op: np.ufunc = np.add, initial: Any = 0
+        self, owners: Owners, values: Array, op: np.ufunc = np.add, initial: Any = 0
     ) -> Array:
         """Do the same for groups whose ``owners_of`` are known. Collective."""
         exchange, slot = owners
@@ -199,7 +202,7 @@ class TornDofs:
         op.at(out, slot, exchange.send(values))
         return out
 
-    def owners_of(self, groups: Array) -> tuple[Exchange, Array]:
+    def owners_of(self, groups: Array) -> Owners:
         """Return the exchange with the owners of groups, and which of theirs it asks. Collective.
 
         Those are positions among the groups that this rank owns, one for each row received.

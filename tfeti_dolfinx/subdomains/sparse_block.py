@@ -18,7 +18,6 @@ from tfeti_dolfinx.common.arrays import (
     Array,
     LocalMatrix,
     as_petsc_matrix,
-    entries_of,
 )
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
@@ -209,11 +208,10 @@ class Traced:
         how.factorizations += 1
         try:
             factor = how.factor if stiffness.mixed else CholeskyFactor
-            if not R.shape[1]:
-                given = entries_of(K_ii) if stiffness.mixed else K_ii
-                return regularised(given, R, inside[:0], how.prefix, factor)
-            fixing = fixing_dofs(stiffness.x, inside // stiffness.bs)
-            return regularised(entries_of(K_ii).csr(), R, fixing, how.prefix, factor)
+            if R.shape[1] or stiffness.mixed:
+                K_ii = LocalMatrix(K_ii).entries().csr()
+            fixing = fixing_dofs(stiffness.x, inside // stiffness.bs) if R.shape[1] else inside[:0]
+            return regularised(K_ii, R, fixing, how.prefix, factor)
         except FactorError as error:
             raise FactorError(
                 f"{stiffness.name}: the stiffness of the unknowns that no constraint touches, for "
