@@ -123,9 +123,7 @@ class Diagnostics:
             lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             # mean slopes of a displacement of each subdomain, (gdim, nodes)
-            self._slopes = [
-                np.linalg.pinv(x.T @ x, EPSILON * len(x), hermitian=True) @ x.T for x in nodes
-            ]
+            self._slopes = [np.linalg.pinv(x.T @ x, EPSILON * len(x), True) @ x.T for x in nodes]
         u = solution.u
         return [
             *_loose(outcome),

@@ -70,8 +70,7 @@ class ContactSearch:
         """Primal nodes of the surfaces of each contact."""
         dofs, facets = self._dofs, self._dofs.decomposition.facets
         return [
-            [np.unique(facet_nodes(dofs, facets(name))) for name in contact.surfaces]
-            for contact in self.contacts
+            [np.unique(facet_nodes(dofs, facets(s))) for s in c.surfaces] for c in self.contacts
         ]
 
     @property
