@@ -325,7 +325,8 @@ class ContactProblem:
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, looks, loose)
         warnings = list[str]()
         if options.warnings:
-            warnings = self._diagnostics.found(dual, solution, outcome, options.number)
+            energy, rtol = accuracy.measures.energies, options.number
+            warnings = self._diagnostics.found(dual, solution, outcome, energy, rtol)
         method, notes = f"{options.qp_type} + {options.pc_type}", notes_of(outcome, solution)
         self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
         body = [*d.body_names, *system.tools.free_names][settling.body]

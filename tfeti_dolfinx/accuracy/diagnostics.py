@@ -18,6 +18,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
+from tfeti_dolfinx.mortar.facets import create_element
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
@@ -35,7 +36,7 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     cell = getattr(basix.CellType, cell_type.name)
     corners = geometry_dofmap(mesh)[:, : len(cell_entities(cell_type, 0))]
     gdim = mesh.geometry.dim
-    element = basix.create_element(basix.ElementFamily.P, cell, 1)
+    element = create_element(basix.ElementFamily.P, cell, 1)
     middle = basix.geometry(cell).mean(axis=0)[None]
     slopes = element.tabulate(1, middle)[1:, 0, :, 0]
     J = np.moveaxis(mesh.geometry.x.T[:gdim, corners] @ slopes.T, 2, 1).copy()  # cells come last
@@ -113,18 +114,20 @@ class Diagnostics:
         self._lasting: list[str] = []
         self._slopes: list[Array] = []
 
-    def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
-        """Sentences beside the ``outcome``, each of which names the thing. Collective."""
+    def found(
+        self, dual: Dual, solution: Solution, outcome: Outcome, energy: Array, rtol: float
+    ) -> list[str]:
+        """Sentences, each of which names the thing, from uᵀKu of each body, too. Collective."""
         if self._of is None or self._of() is not dual:
             nodes = self._points(dual.subdomains)
             lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             # mean slopes of a displacement of each subdomain, (gdim, nodes)
-            self._slopes = [np.linalg.pinv(own, EPSILON * len(own)) for own in nodes]
+            self._slopes = [np.linalg.pinv(x.T @ x, EPSILON * len(x), True) @ x.T for x in nodes]
         u = solution.u
         return [
             *_loose(outcome),
-            *self._rounding(dual, u, rtol),
+            *self._rounding(dual, u, energy, rtol),
             *self._turned(u, dual.subdomains),
             *self._facets(solution, dual.subdomains),
             *self._lasting,
@@ -171,7 +174,7 @@ class Diagnostics:
                 "it too stiff (locking) unless its law is selective; expected degree 2"
             )
 
-    def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
+    def _rounding(self, dual: Dual, u: Array, energy: Array, rtol: float) -> Iterator[str]:
         """Warn of slender bodies, whose small bending energy is inexact by the rounding of K.
 
         That of uᵀKu is about ε uᵀDu, D the diagonal, of u less the rigid motion of the body.
@@ -182,7 +185,7 @@ class Diagnostics:
         diagonal = joined([block.diagonal for block in subdomains.blocks])
         parts = subdomains.dof_parts
         squares = [sums(diagonal * of**2, parts) for of in (bent, u)]
-        energy, terms, moved = subdomains.of_bodies([subdomains.energies(u), *squares])
+        terms, moved = subdomains.of_bodies(squares)
         # that of a body which only moves is rounding
         known = energy > EPSILON * np.maximum(energy, EPSILON * moved).max(initial=0.0)
         share = (

@@ -17,6 +17,8 @@ Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
+# multiplications that take as long as a call of PETSc, and as to make two dense matrices of it
+CALL, DENSE = 2_000, 30_000
 EPSILON = float(np.finfo(float).eps)  # relative rounding of a number
 
 
@@ -89,16 +91,14 @@ def transposed(A: Any) -> Entries:
     return entries_at(A.indices, row, A.data, A.shape[::-1])
 
 
-def entries_within(A: Any, rows: Array | slice, columns: Array) -> Entries:
-    """Return A[rows][:, columns] of a CSR matrix, columns ascending."""
-    rows = np.arange(A.shape[0])[rows]
+def columns_of(A: Any, columns: Array) -> Entries:
+    """Return A[:, columns] of a CSR matrix, columns ascending."""
     place = np.full(A.shape[1], -1, dtype=A.indices.dtype)
     place[columns] = np.arange(len(columns))
-    entries, table = entries_of_rows(A, rows)
-    column = place[A.indices[entries]]
+    column = place[A.indices]
     kept = column >= 0
-    table = np.concatenate(([0], np.cumsum(kept)))[table]
-    return Entries(A.data[entries[kept]], column[kept], table, (len(rows), len(columns)))
+    table = np.concatenate(([0], np.cumsum(kept)))[A.indptr]
+    return Entries(A.data[kept], column[kept], table, (A.shape[0], len(columns)))
 
 
 def plus(A: Any, row: Array, column: Array, value: Array) -> Entries:
@@ -148,14 +148,17 @@ class LocalMatrix:
     ``count`` is the number of its entries.
     """
 
-    def __init__(self, A: csr_array | Entries) -> None:
-        self.shape, self.count, self._petsc = A.shape, len(A.data), as_petsc_matrix(A)
+    def __init__(self, A: csr_array | Entries | PETSc.Mat) -> None:
+        self._petsc = A if isinstance(A, PETSc.Mat) else as_petsc_matrix(A)
+        self.shape, self.count = self._petsc.getSize(), int(self._petsc.getInfo()["nz_used"])
         # sums are those of scipy to the last bit, and so the same in any number of columns
         self._petsc.setOption(PETSc.Mat.Option.USE_INODES, False)
         self._x, self._y = self._petsc.createVecs()
 
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
+        if x.ndim > 1 and self._is_little(x):
+            return np.array([self @ column for column in x.T]).T
         if x.ndim > 1:
             return of_columns(self._petsc.matMult, x, self.shape[0])
         self._x.setArray(x)
@@ -164,11 +167,25 @@ class LocalMatrix:
 
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""
+        if y.ndim > 1 and self._is_little(y):
+            return np.array([self.transposed(column) for column in y.T]).T
         if y.ndim > 1:
             return of_columns(self._petsc.transposeMatMult, y, self.shape[1])
         self._y.setArray(y)
         self._petsc.multTranspose(self._y, self._x)
         return np.array(self._x.array_r)
+
+    def _is_little(self, x: Array) -> bool:
+        """Return whether products with columns, not none, take less time one by one."""
+        return 0 < (CALL + self.count) * x.shape[1] < DENSE
+
+    def part(self, rows: Array, columns: Array) -> PETSc.Mat:
+        """Return A[rows][:, columns]."""
+        sets = [
+            PETSc.IS().createGeneral(places.astype(PETSc.IntType), PETSc.COMM_SELF)
+            for places in (rows, columns)
+        ]
+        return self._petsc.createSubMatrix(*sets)
 
     def is_symmetric(self, tolerance: float) -> bool:
         """Return whether entries of A − Aᵀ are at most this large."""

@@ -119,18 +119,20 @@ class Exchange:
 
     def send(self, rows: Array) -> Array:
         """Send ``rows`` (first axis of length n) and return the rows received (m of them)."""
-        return self._travel(np.asarray(rows)[self._order], self._sent, self._received)
+        if self._comm.size == 1:
+            return np.array(rows)
+        return self._travel(np.take(rows, self._order, axis=0), self._sent, self._received)
 
     def answer(self, rows: Array) -> Array:
         """Send one row back for each received row; returns them in the order first sent."""
+        if self._comm.size == 1:
+            return np.array(rows)
         back = self._travel(np.asarray(rows), self._received, self._sent)
         answers = np.empty_like(back)
         answers[self._order] = back
         return answers
 
     def _travel(self, rows: Array, sent: Array, received: Array) -> Array:
-        if self._comm.size == 1:
-            return np.array(rows)
         rows = np.ascontiguousarray(rows)
         out = np.empty((int(received.sum()), *rows.shape[1:]), dtype=rows.dtype)
         width = int(np.prod(rows.shape[1:], dtype=np.int64)) * rows.dtype.itemsize

@@ -256,14 +256,11 @@ class Obstacle(ContactPartner):
         At the first search the shape has to fit: later the surface may have turned away from it.
         """
         # of a scalar space the gradient's first component counts
-        if stiffness is not None and dofs.bs > 1:
-            self._check_shape(dofs)
-        return super().settled(dofs, contact, reach, stiffness, flag)
+        first = stiffness is not None and dofs.bs > 1
+        return self, self._met(dofs, contact, reach, flag, first)
 
-    def _check_shape(self, dofs: TornDofs) -> None:
+    def _check_shape(self, dofs: TornDofs, facets: Facets) -> None:
         """Raise an InputError unless the gradient is the distance's and a facet faces the shape."""
-        surface = surface_facets(dofs.decomposition, self.surface)
-        facets = local_facets(dofs, surface, facet_kind(dofs))
         centres, size = facets.corners.mean(axis=1), diameter(dofs.decomposition)
         check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
@@ -283,8 +280,16 @@ class Obstacle(ContactPartner):
         given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
         n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
+        return self._met(dofs, contact, reach, flag)
+
+    def _met(
+        self, dofs: TornDofs, contact: int, reach: float, flag: Flag, first: bool = False
+    ) -> ContactRecords:
+        """Return the conditions of ``records``, at first of a shape that fits. Collective."""
         kind = facet_kind(dofs)
-        facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface), kind)
+        facets = local_facets(dofs, dofs.decomposition.facets(self.surface), kind)
+        if first:
+            self._check_shape(dofs, facets)
         corners = facets.corners
         with raised_on_all_ranks(dofs.comm):
             distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)
@@ -463,7 +468,7 @@ class Contact(ContactPartner):
             )
         sides, kind = [], facet_kind(dofs)
         for surface in self.surfaces:
-            facets = local_facets(dofs, surface_facets(dofs.decomposition, surface), kind)
+            facets = local_facets(dofs, dofs.decomposition.facets(surface), kind)
             whole = facets.radius ** (dofs.bs - 1)
             if count := count_over(dofs.comm, facets.area <= SEARCH.degenerate * whole):
                 raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")

@@ -10,8 +10,8 @@ from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
-from tfeti_dolfinx.common.parallel import largest, summed
-from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.common.parallel import any_rank, largest, summed
+from tfeti_dolfinx.mesh.dofs import Owners, TornDofs
 from tfeti_dolfinx.mortar.facets import Facets, hat_integrals
 from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals, Triplets
 from tfeti_dolfinx.mortar.segments import frames
@@ -153,14 +153,17 @@ def conditions(
     is below 1e-6. The gaps are those of the geometry, all conditions are taken to be within reach,
     and none has friction.
     """
-    area = dofs.reduce_on_owners(integrals.vertices.ravel(), integrals.covered.ravel())
+    owners = dofs.owners_of(integrals.vertices.ravel())
+    area = dofs.reduced(owners, integrals.covered.ravel())
     whole = dofs.reduce_on_owners(side.facets.vertices.ravel(), side.areas.ravel())
     chosen = np.flatnonzero(area > SEARCH.hardly_covered * whole)
-    vertices, areas = integrals.vertices, area[chosen]
+    areas = area[chosen]
     # what rounding of coordinates may make of a gap
     rounding = SEARCH.no_gap * largest(dofs.comm, dofs.V.mesh.geometry.x)
-    gap, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen, rounding)
-    curved_gap, spread = _mean_gaps(dofs, vertices, integrals.curved_gap, areas, chosen, rounding)
+    gap, spread = _mean_gaps(dofs, owners, integrals.gap, areas, chosen, rounding)
+    curved_gap, curved = gap, integrals.curved_gap
+    if any_rank(dofs.comm, curved is not integrals.gap):
+        curved_gap, spread = _mean_gaps(dofs, owners, curved, areas, chosen, rounding)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, integrals.entries)
@@ -194,17 +197,16 @@ def conditions(
 
 
 def _mean_gaps(
-    dofs: TornDofs, vertices: Array, gap: GapIntegrals, area: Array, chosen: Array, rounding: float
+    dofs: TornDofs, owners: Owners, gap: GapIntegrals, area: Array, chosen: Array, rounding: float
 ) -> tuple[Array, Array]:
     """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
 
     Where nodes have moved there is none from above, which does not follow u as rows do: Newton's
     method would close that gap a step. Means up to ``rounding`` are 0. Collective.
     """
-    groups = vertices.ravel()
-    total = dofs.reduce_on_owners(groups, gap.total.ravel())[chosen]
-    low = dofs.reduce_on_owners(groups, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
-    high = dofs.reduce_on_owners(groups, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
+    total = dofs.reduced(owners, gap.total.ravel())[chosen]
+    low = dofs.reduced(owners, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
+    high = dofs.reduced(owners, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
     mean = np.clip(total / area, low, high if dofs.nodes is None else np.inf)
     return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 

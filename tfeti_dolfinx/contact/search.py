@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
@@ -61,13 +62,16 @@ class ContactSearch:
         ]
         self.contacts = [contact for contact, _ in settled]
         self._records = [self._from_origin(i, records) for i, (_, records) in enumerate(settled)]
-        # primal nodes of the surfaces of each contact
-        self._nodes = [
-            [np.unique(facet_nodes(dofs, decomposition.facets(name))) for name in contact.surfaces]
-            for contact in self.contacts
-        ]
         # beside the conditions that they were found with, some up to a larger reach
         self._wide: dict[int, tuple[ContactRecords, ContactRecords, float]] = {}
+
+    @cached_property
+    def _nodes(self) -> list[list[Array]]:
+        """Primal nodes of the surfaces of each contact."""
+        dofs, facets = self._dofs, self._dofs.decomposition.facets
+        return [
+            [np.unique(facet_nodes(dofs, facets(s))) for s in c.surfaces] for c in self.contacts
+        ]
 
     @property
     def records(self) -> ContactRecords:

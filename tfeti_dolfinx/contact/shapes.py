@@ -207,9 +207,10 @@ def distance_and_gradient(shape: Shape, x: Array, what: str) -> tuple[Array, Arr
     n, gdim = x.shape
     if n == 0:
         return np.zeros(0), np.zeros((0, 3))
-    points = np.pad(x.T, ((0, 3 - gdim), (0, 0)))
-    distance = values_at(shape.distance, points, (n,), f"{what}: the distance at")
-    return distance, values_at(shape.gradient, points, (3, n), f"{what}: the gradient at").T
+    points = np.zeros((n, 3))
+    points[:, :gdim] = x
+    distance = values_at(shape.distance, points.T, (n,), f"{what}: the distance at")
+    return distance, values_at(shape.gradient, points.T, (3, n), f"{what}: the gradient at").T
 
 
 def check_placement(

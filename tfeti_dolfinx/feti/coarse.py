@@ -81,15 +81,16 @@ class CoarseSpace(Coarse):
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         Gt = transposed_G(B, kernel, dimension)
         self.springs, self.sigma = springs, sigma
-        per_spring = csr_array(subdomains.spring_rows / np.sqrt(sigma))
-        if len(springs):  # behind all others
-            place = (per_spring.data, self._own.start + per_spring.indices, per_spring.indptr)
-            wide = csr_array(place, shape=(len(springs), dimension))
-            Gt = csr_array(vstack((Gt[: -len(springs)], wide)))
         indptr, _, data = B.getValuesCSR()
         row = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
         sizes = np.bincount(row, np.abs(data), minlength=len(indptr) - 1).astype(float)
-        sizes[springs] = np.sqrt(per_spring.power(2).sum(axis=1))
+        if len(springs):  # behind all others
+            own = csr_array(subdomains.spring_rows / np.sqrt(sigma))
+            place = (own.data, self._own.start + own.indices, own.indptr)
+            Gt = csr_array(
+                vstack((Gt[: -len(springs)], csr_array(place, shape=(len(springs), dimension))))
+            )
+            sizes[springs] = np.sqrt(own.power(2).sum(axis=1))
         self.row_size = np.where(sizes > 0.0, sizes, 1.0)
         self.bodies = Bodies(subdomains)
         self.J = self._on_bodies(Gt)

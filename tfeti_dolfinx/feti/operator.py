@@ -9,7 +9,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array, entries_of_rows, entries_within, joined, node_means
+from tfeti_dolfinx.common.arrays import Array, entries_of_rows, joined, node_means
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.qp.problem import Operator
@@ -40,10 +40,10 @@ def near_stiffness(blocks: Sequence[SparseBlock], rigid: int = 0) -> tuple[csr_a
         place = np.append(
             start + np.argsort(block.place[block.trace_dofs]), end + np.arange(len(next_to))
         )
-        part = entries_within(K, kept, kept)
-        rows.append(np.repeat(place, np.diff(part.indptr)))
-        columns.append(place[part.indices])
-        values.append(part.data)
+        table, column, data = block.stiffness.product.part(kept, kept).getValuesCSR()
+        rows.append(np.repeat(place, np.diff(table)))
+        columns.append(place[column])
+        values.append(data)
         means.append(node_means(block.stiffness.diagonal, bs)[next_to])
         start, end = start + len(trace), end + len(next_to)
     where = np.concatenate(rows), np.concatenate(columns)

@@ -132,10 +132,10 @@ class NullModes:
     """
 
     def __init__(self, columns: csr_array) -> None:
-        C = LocalMatrix(columns)
         self._parts = [(rows, dense) for _, rows, dense in parts_of_columns(columns)]
         self.removed: Callable[[Array], Array] = np.asarray
         if self._parts:
+            C = LocalMatrix(columns)
             self.removed = lambda x: np.asarray(x - C @ C.transposed(x))
 
     def pinned(self, scale: Array) -> Array:

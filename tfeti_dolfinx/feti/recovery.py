@@ -63,7 +63,7 @@ def recover(
     u = elastic_displacement(constraints, subdomains, lam, subdomains.pinv_load)
     residual = constraints.c - constraints.jumps(u[subdomains.trace])  # = Fλ − d
     residual[coarse.springs] = -coarse.spring_ends(lam, u)
-    alpha: Array = np.zeros(0)
+    gap = residual
     if coarse.dimension:
         held = face.holding
         alpha = coarse.solve(coarse.G(residual - np.where(held, 0.0, gradient)))
@@ -71,8 +71,7 @@ def recover(
             left = np.where(held, residual - coarse.rows @ alpha, 0.0)
             on_held = Face(held, face.status)
             alpha = alpha + coarse.damped_solve(on_held, coarse.G(left), damping)
-        u = u + coarse.kernel_motion(alpha)
-    gap = residual - coarse.Gt @ alpha
+        u, gap = u + coarse.kernel_motion(alpha), residual - coarse.rows @ alpha
     # what sticks to a given bound holds, pushed or not; under Coulomb's law what is pushed or pulls
     borne, active = np.abs(lam) > no_effect * error, np.zeros(len(lam), dtype=bool)
     at = constraints.pressed
@@ -123,7 +122,7 @@ def placed(coarse: CoarseSpace, state: Recovered, begin: Array | float, unseen: 
                 by[at] = seen @ motion[part]
             closed = np.split(by, np.cumsum([len(gap) for gap in gaps])[:-1])
     alpha = coarse.motions @ np.asarray(N @ bcast_from_root(comm, motion))
-    u, gap = state.u + coarse.kernel_motion(alpha), state.gap - coarse.Gt @ alpha
+    u, gap = state.u + coarse.kernel_motion(alpha), state.gap - coarse.rows @ alpha
     gap[rows] = state.gap[rows] - coarse.row_size[rows] * comm.scatter(closed, root=0)
     return replace(state, u=u, gap=gap)
 

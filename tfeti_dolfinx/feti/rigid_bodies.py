@@ -13,7 +13,7 @@ from scipy.linalg import qr
 from scipy.sparse import csc_array, csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import Array, Entries, beside, entries_at, entries_within, sum_rows
+from tfeti_dolfinx.common.arrays import Array, Entries, beside, columns_of, entries_at, sum_rows
 from tfeti_dolfinx.common.parallel import bcast_from_root, rows_over
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -218,7 +218,7 @@ class Motions:
         columns = np.repeat(np.arange(n * k).reshape(n, k), k, axis=0).ravel()
         table, shape = k * np.arange(n * k + 1), (n * k, n * k)
         every = Entries(self.single.ravel(), columns, table, shape)
-        return entries_within(every, slice(None), np.flatnonzero(self.free)).csr()
+        return columns_of(every, np.flatnonzero(self.free)).csr()
 
     @property
     def count(self) -> int:
@@ -451,7 +451,7 @@ class KernelBasis:
         numbers, width = np.cumsum(self.kept) - 1, int(self.kept.sum())
         numbers = numbers.reshape(self.kept.shape)
         GtM = along.entries(self.kept[body] & ~zero, numbers, width)
-        return beside(GtM, entries_within(Gt, slice(None), self.rest)).csr()
+        return beside(GtM, columns_of(Gt, self.rest)).csr()
 
 
 def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
@@ -483,8 +483,8 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
         first.append(np.linalg.solve(M[chosen], X.parts[own[chosen]]))
         left[own] -= M @ first[-1]
     pinned = np.concatenate(pins)
-    others = np.setdiff1d(np.arange(len(left)), pinned)
-    rest = np.setdiff1d(np.arange(X.shape[0]), X.row[pinned])
+    others = np.delete(np.arange(len(left)), pinned)
+    rest = np.delete(np.arange(X.shape[0]), X.row[pinned])
     coordinates = BodyRows(
         np.append(np.arange(len(pinned)), len(pinned) + np.searchsorted(rest, X.row[others])),
         X.body[np.append(pinned, others)],

@@ -16,6 +16,9 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.untorn import cell_entities, exchange_by_key, mix, set_key
 
+# the exchange with the owners of groups, and which of theirs each row asks
+Owners = tuple[Exchange, Array]
+
 # --- Function spaces on a torn mesh -----------------------------------------------------------
 
 
@@ -151,15 +154,15 @@ class TornDofs:
     def points(self) -> Array:
         """Return the place of each primal node, shape ``(n, 3)``."""
         x = self.V.tabulate_dof_coordinates() if self.nodes is None else self.nodes
-        return np.asarray(x[self.dolfinx_node])
+        return np.asarray(x.take(self.dolfinx_node, axis=0))
 
     def to_primal(self, values: Array) -> Array:
         """Unrolled dof values from DOLFINx's order to primal order, shape ``(n * bs,)``."""
-        return values.reshape(-1, self.bs)[self.dolfinx_node].ravel()
+        return values.reshape(-1, self.bs).take(self.dolfinx_node, axis=0).ravel()
 
     def to_dolfinx(self, values: Array) -> Array:
         """Unrolled dof values from primal order to DOLFINx's order, shape ``(n * bs,)``."""
-        return values.reshape(-1, self.bs)[self.primal_node].ravel()
+        return values.reshape(-1, self.bs).take(self.primal_node, axis=0).ravel()
 
     def dolfinx_dofs(self) -> Array:
         """DOLFINx's unrolled dof for each primal dof, shape ``(n * bs,)``."""
@@ -174,12 +177,12 @@ class TornDofs:
 
     def spread(self, values: Array) -> Array:
         """Give every copy its group's value: shape ``(g, ...)`` to ``(n, ...)``. Collective."""
-        return self._to_owner.answer(values[self._to_owner_slot])
+        return self._to_owner.answer(values.take(self._to_owner_slot, axis=0))
 
     def lookup(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
         """Rows for any groups, ``(k,)``, of tables with a row per owned group. Collective."""
         exchange, asked = self.owners_of(groups)
-        return tuple(exchange.answer(table[asked]) for table in tables)
+        return tuple(exchange.answer(table.take(asked, axis=0)) for table in tables)
 
     def reduce_on_owners(
         self, groups: Array, values: Array, op: np.ufunc = np.add, initial: Any = 0
@@ -188,12 +191,18 @@ class TornDofs:
 
         ``op`` is as in ``reduce``, ``initial`` its neutral element. Collective.
         """
-        exchange, slot = self.owners_of(groups)
+        return self.reduced(self.owners_of(groups), values, op, initial)
+
+    def reduced(
+        self, owners: Owners, values: Array, op: np.ufunc = np.add, initial: Any = 0
+    ) -> Array:
+        """Do the same for groups whose ``owners_of`` are known. Collective."""
+        exchange, slot = owners
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
         op.at(out, slot, exchange.send(values))
         return out
 
-    def owners_of(self, groups: Array) -> tuple[Exchange, Array]:
+    def owners_of(self, groups: Array) -> Owners:
         """Return the exchange with the owners of groups, and which of theirs it asks. Collective.
 
         Those are positions among the groups that this rank owns, one for each row received.
@@ -222,7 +231,7 @@ class TornDofs:
 
     def gather_copies(self, values: Array) -> Array:
         """Give values of nodes, ``(n, ...)``, to the owned ``copies``, ``(c, ...)``. Collective."""
-        return self._to_owner.send(values)[self._copy_order]
+        return self._to_owner.send(values).take(self._copy_order, axis=0)
 
     def lookup_copies(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
         """Find all copies of groups, ``(k,)``, and their rows of tables. Collective.

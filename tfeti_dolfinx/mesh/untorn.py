@@ -1,6 +1,7 @@
 """Meshes before they are torn: cells, their facets and edges."""
 
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import basix
@@ -32,6 +33,7 @@ def set_key(ids: Array) -> Array:
     return mix(ids).sum(axis=-1, dtype=np.uint64)
 
 
+@cache
 def cell_entities(cell_type: dmesh.CellType, dim: int) -> list[Array]:
     """Local vertices of each entity of dimension ``dim``, in DOLFINx's order."""
     cell = getattr(basix.CellType, cell_type.name)

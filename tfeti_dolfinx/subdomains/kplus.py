@@ -68,7 +68,7 @@ def regularised(
     K_ρ⁻¹ is an exact generalised inverse, because N R is regular (Brzobohatý, Dostál, Kozubek,
     Kovář, Markopoulos, IJNME 88, 2011, section 4). Raise a NotPositiveDefiniteError where K_ρ has
     no Cholesky factor; a FactorError where it could not be made for another reason. K is scipy CSR,
-    or ``Entries`` where R has no columns; the fixing unknowns ascend.
+    or PETSc's where R has no columns; the fixing unknowns ascend.
     """
     if R.shape[1] == 0:
         return factor(K, prefix)

@@ -134,7 +134,7 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """K_bb of all subdomains as one sparse matrix, on one column."""
-    traces = {id(block.traced): block.traced.entries() for block, _ in blocks}
+    traces = {id(block.traced): block.traced.stiffness.entries() for block, _ in blocks}
     matrices = [traces[id(block.traced)] for block, _ in blocks]
     begins = np.cumsum([0, *(K.shape[0] for K in matrices)])
     columns = [a + K.indices for a, K in zip(begins, matrices, strict=False)]

@@ -10,17 +10,14 @@ from typing import Any
 from weakref import WeakSet, WeakValueDictionary
 
 import numpy as np
-from scipy.linalg import null_space
+from petsc4py import PETSc
 from scipy.linalg.lapack import dpocon, dpotrf, dpotri
-from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import (
     TINY,
     Array,
-    Entries,
     LocalMatrix,
-    entries_of_rows,
-    entries_within,
+    as_petsc_matrix,
 )
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
@@ -183,19 +180,15 @@ class Traced:
             return Kw
         return Kw - self.coupling.transposed(self.inner.roughly(self.coupling @ w))
 
-    def entries(self) -> Entries:
-        """K_bb, that on the trace."""
-        return entries_within(self._of.K, self.trace, self.trace)
-
     @cached_property
     def stiffness(self) -> LocalMatrix:
-        """K_bb for products."""
-        return LocalMatrix(self.entries())
+        """K_bb, that on the trace."""
+        return LocalMatrix(self._of.product.part(self.trace, self.trace))
 
     @cached_property
     def coupling(self) -> LocalMatrix:
         """K_ib."""
-        return LocalMatrix(entries_within(self._of.K, self.inside, self.trace))
+        return LocalMatrix(self._of.product.part(self.inside, self.trace))
 
     @cached_property
     def inner(self) -> CholeskyFactor | None:
@@ -208,13 +201,16 @@ class Traced:
             return None
         # the triangle has the null space of the kernel's trace rows, and few rows itself
         triangle = np.linalg.qr(stiffness.null[self.trace], mode="r")
-        R = stiffness.null[inside] @ null_space(triangle, rcond=TOLERANCES.on_trace)
-        how, K_ii = stiffness.how, entries_within(stiffness.K, inside, inside)
+        _, sizes, V = np.linalg.svd(triangle)
+        seen = int(np.sum(sizes > TOLERANCES.on_trace * sizes.max(initial=0.0)))
+        R = stiffness.null[inside] @ V[seen:].T
+        how, K_ii = stiffness.how, stiffness.product.part(inside, inside)
         how.factorizations += 1
         try:
-            fixing = fixing_dofs(stiffness.x, inside // stiffness.bs)
-            K_ii = K_ii.csr() if R.shape[1] else K_ii
             factor = how.factor if stiffness.mixed else CholeskyFactor
+            if R.shape[1] or stiffness.mixed:
+                K_ii = LocalMatrix(K_ii).entries().csr()
+            fixing = fixing_dofs(stiffness.x, inside // stiffness.bs) if R.shape[1] else inside[:0]
             return regularised(K_ii, R, fixing, how.prefix, factor)
         except FactorError as error:
             raise FactorError(
@@ -321,9 +317,9 @@ def _equal(K: Any, other: Stiffness, here: Array) -> bool:
     # the diagonals tell most of those apart that are not
     if not np.abs(K.diagonal() - other.diagonal[here]).max(initial=0.0) <= allowed:
         return False
-    entries, table = entries_of_rows(K, np.argsort(here))
-    moved = csr_array((K.data[entries], here[K.indices[entries]], table), shape=K.shape)
-    return bool(np.abs((moved - other.K).data).max(initial=0.0) <= allowed)
+    apart = other.product.part(here, here)
+    apart.axpy(-1.0, as_petsc_matrix(K), PETSc.Mat.Structure.UNKNOWN)
+    return bool(np.abs(apart.getValuesCSR()[2]).max(initial=0.0) <= allowed)
 
 
 # --- Block of sparse finite elements ----------------------------------------------------------

@@ -9,7 +9,6 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import (
     Array,
-    entries_at,
     entries_of_rows,
     joined,
     node_blocks,
@@ -136,8 +135,7 @@ class Subdomains:
     def kernel_rows(self) -> csr_array:
         """R on the trace, shape ``(t, r)``."""
         parts = [block.kernel[block.trace_dofs] for block in self.blocks]
-        shape = len(self.trace), sum(part.shape[1] for part in parts)
-        return _assembled(parts, self.trace_parts, self.kernel_parts, shape)
+        return self._on_kernels(parts)
 
     @property
     def spring_rows(self) -> csr_array:
@@ -148,8 +146,12 @@ class Subdomains:
             else np.sqrt(own.stiffness)[:, None] * (own.stretches.T @ block.kernel)
             for block in self.blocks
         ]
-        shape = sum(map(len, parts)), sum(part.shape[1] for part in parts)
-        return _assembled(parts, self.spring_parts, self.kernel_parts, shape)
+        return self._on_kernels(parts)
+
+    def _on_kernels(self, parts: Sequence[Array]) -> csr_array:
+        """Parts of the Blocks, with their kernels' coordinates as columns."""
+        first = [part.start for part in self.kernel_parts]
+        return _assembled(parts, first, sum(part.shape[1] for part in parts))
 
     @property
     def kernel_load(self) -> Array:
@@ -178,9 +180,8 @@ class Subdomains:
     def modes_in_kernel(self) -> csr_array:
         """Rᵀ C, C the candidate modes of all bodies, shape ``(r, b * k)``."""
         parts = [block.kernel.T @ block.modes for block in self.blocks]
-        bodies = [slice(self.num_modes * int(body), None) for body in self.body_of_block]
-        shape = sum(map(len, parts)), self.num_bodies * self.num_modes
-        return _assembled(parts, self.kernel_parts, bodies, shape)
+        k = self.num_modes
+        return _assembled(parts, k * self.body_of_block, k * self.num_bodies)
 
     def modes_outside(self) -> Array:
         """Σ Cᵀ(I − R Rᵀ)C / tr CᵀC over the Blocks of a body, shape ``(b, k, k)``. Collective.
@@ -270,7 +271,7 @@ class Subdomains:
         u, found = np.array(displacements), np.zeros((len(self.blocks), len(displacements)))
         for at, (block, part) in enumerate(self.block_parts):
             nodes = u[:, part].reshape(len(u), -1, block.bs)
-            found[at] = np.einsum("qni,qni->qn", nodes, nodes).max(axis=1, initial=0.0)
+            found[at] = sum(np.moveaxis(nodes**2, 2, 0)).max(axis=1, initial=0.0)
         return self.of_bodies(np.sqrt(found).T, largest=True)
 
     def _on_bodies(
@@ -284,17 +285,14 @@ class Subdomains:
         return total
 
 
-def _assembled(
-    parts: Sequence[Array], rows: Sequence[slice], columns: Sequence[slice], shape: tuple[int, int]
-) -> csr_array:
-    """Dense parts at these rows and columns of a sparse matrix."""
-    places, values = [np.empty((2, 0), dtype=np.int64)], []
-    for part, row, column in zip(parts, rows, columns, strict=True):
-        i, j = np.indices(part.shape)
-        places.append(np.stack(((row.start + i).ravel(), (column.start + j).ravel())))
-        values.append(part.ravel())
-    row_of, column_of = np.concatenate(places, axis=1)
-    return entries_at(row_of, column_of, joined(values), shape).csr()
+def _assembled(parts: Sequence[Array], first: Sequence[int] | Array, width: int) -> csr_array:
+    """Dense parts one below the other as a sparse matrix, with the first column of each."""
+    rows, columns = np.array([p.shape for p in parts], dtype=np.int64).reshape(-1, 2).T
+    table = np.concatenate(([0], np.cumsum(np.repeat(columns, rows))))
+    pairs = zip(parts, first, strict=True)
+    indices = joined([np.tile(a + np.arange(p.shape[1]), len(p)) for p, a in pairs])
+    data = joined([p.ravel() for p in parts])
+    return csr_array((data, indices.astype(np.int64), table), shape=(rows.sum(), width))
 
 
 # --- From the forms to the Blocks -------------------------------------------------------------
