@@ -212,7 +212,11 @@ def test_a_page_lists_all_programs(folder, page):
     assert not [name for name in programs if f"`{name}`" not in text]
 
 
-def test_notation_names_what_is_in_the_code():
+def test_documents_name_what_is_in_the_code():
+    files = [f"/{p.relative_to(ROOT)}" for p in ROOT.rglob("*.py")]
+    for page in (ROOT / "CONTRIBUTING.md", *DOCUMENTS):
+        named = re.findall(r"`([\w/]+\.py)`", page.read_text())
+        assert not [n for n in named if not any(f.endswith(f"/{n}") for f in files)], page
     code = "\n".join(p.read_text() for p in (ROOT / "tfeti_dolfinx").rglob("*.py"))
     for folder in ("demos", "benchmarks"):
         code += "\n".join(p.read_text() for p in (ROOT / folder).glob("*.py"))

@@ -326,10 +326,10 @@ def _grid(solution: Solution, fields: dict[str, Array]) -> dict[str, Array]:
     cells, types, points = np.zeros(0, np.int32), np.zeros(0, np.uint8), np.zeros((0, 3))
     if len(u.x.array):
         cells, types, points = dplot.vtk_mesh(u.function_space)
-    moved = np.zeros_like(points)
-    bs = u.function_space.dofmap.index_map_bs
-    moved[:, :bs] = u.x.array.reshape(-1, bs)
+    moved, dofs = np.zeros_like(points), solution.dofs
+    moved[:, : dofs.bs] = u.x.array.reshape(-1, dofs.bs)
     grid: dict[str, Array] = {"cells": cells, "types": types, "points": points, "moved": moved}
+    grid["group"] = dofs.group[dofs.primal_node]
     body = decomposition.body_of_subdomain[subdomain]
     return {**grid, **fields, "body": body, "subdomain": subdomain}
 
@@ -346,18 +346,11 @@ def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
     if not tables:
         return whole
     table = np.concatenate(tables)
-    # nodes of one body at one place are one: torn copies agree
-    points, width = whole["points"], table.shape[1]
-    body = np.zeros(len(points))
-    body[table] = whole["body"][:, None]
-    size = max(float(np.ptp(points, axis=0).max()), 1e-300)
-    places = np.column_stack((body, np.round((points - points.min(axis=0)) / size * 1e9) + 0.0))
-    _, first, node = np.unique(places, axis=0, return_index=True, return_inverse=True)
-    counts = np.full(len(table), width)
-    for name, values in whole.items():
-        if len(values) == len(points) and name not in ("cells", "types", "body", "subdomain"):
-            whole[name] = values[first]
-    whole["cells"] = np.column_stack((counts, node.reshape(-1)[table])).ravel()
+    # torn copies of a node are one
+    _, first, node = np.unique(whole["group"], return_index=True, return_inverse=True)
+    for name in whole.keys() - {"cells", "types", "body", "subdomain"}:
+        whole[name] = whole[name][first]
+    whole["cells"] = np.column_stack((np.full(len(table), table.shape[1]), node[table])).ravel()
     return whole
 
 

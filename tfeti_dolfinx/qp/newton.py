@@ -199,7 +199,7 @@ class NewtonIteration:
         mu: Multipliers μ of Gλ = e, replicated.
         s: Multipliers of Ω, Fλ − d − Gᵀμ: 0 where λ is free, if it is optimal.
         back: λ̂, the nearest feasible point to λ − ᾱs.
-        pressed: The face of λ̂: a row that carries less than it is open by, λ_i < ᾱs_i, is open.
+        pressed: The face of λ̂: a row is open whose force is less than ᾱ times its gap, λ_i < ᾱs_i.
             Where forces are rounding of 0 they do not say which rows touch.
         residual: ‖g^P‖, g^P = (λ − λ̂)/ᾱ.
         norm: Estimate of ‖F‖; ᾱ is its inverse. rounding: What that may make of ‖g^P‖ alone.

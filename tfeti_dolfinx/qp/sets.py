@@ -57,7 +57,7 @@ class Face:
 
     @cached_property
     def carrying(self) -> Array:
-        """Rows that carry a force, all but the open ones; flags, shape ``(m,)``."""
+        """Rows that are not on their bound, all but the open ones; flags, shape ``(m,)``."""
         return np.asarray(self.status != Status.OPEN)
 
     @cached_property
