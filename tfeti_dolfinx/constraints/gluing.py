@@ -27,7 +27,7 @@ from tfeti_dolfinx.constraints.rows import (
     assemble_constraints,
     stack,
 )
-from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
+from tfeti_dolfinx.contact.records import ContactRecords, Friction, relative_motion
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
@@ -279,6 +279,18 @@ class Gluing:
         """Return the conditions that prescribed components decide and that touch. Collective."""
         at, (_, left, rounding) = self.contact.decided, self._held()
         return np.asarray(at[np.abs(left[at]) <= rounding[at]])
+
+    def forced_slip(self) -> Array:
+        """Return slips that are prescribed as all tangents of a node are, ``(n, gdim - 1)``.
+
+        They are those of conditions with friction that have a normal row, and no tangential ones;
+        others are not numbers. Collective.
+        """
+        along = np.einsum("ntg,ng->nt", self.records.tangents, self._held()[0])
+        forced = self.records.friction != Friction.NONE
+        forced &= np.isin(np.arange(len(forced)), self.contact.condition)
+        forced[self.tangents.condition] = False
+        return np.where(forced[:, None], along - self.slip, np.nan)
 
     def _held(self) -> tuple[Array, Array, Array]:
         """Return what prescribed components make of all v_i, and what that leaves of gaps.
