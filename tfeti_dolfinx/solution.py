@@ -494,17 +494,26 @@ class Solution:
         return force + self._forced_friction
 
     @cached_property
+    def forced_slip(self) -> Array:
+        """Slips along tangents that are prescribed, ``(n, gdim - 1)``. Collective at first use.
+
+        Where they are not, they are no numbers.
+        """
+        slip = self.gluing.forced_slip()
+        slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
+        return slip
+
+    @cached_property
     def _forced_friction(self) -> Array:
-        """The part of it where a node is made to slip: rows have no part in that. Collective."""
+        """The part of it where all slip is prescribed: rows have no part in that. Collective."""
         records = self.gluing.records
         if self.friction is None:
             return np.zeros(records.normal.shape)
-        slip = np.nan_to_num(self.gluing.forced_slip())
-        slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
         given = np.where(records.friction == Friction.COULOMB, self.force, self.area)
         bound = self.friction * given[:, None]
-        size = np.linalg.norm(bound * slip, axis=1, keepdims=True)
-        return -np.einsum("nt,ntg->ng", quotient(bound**2 * slip, size), records.tangents)
+        pull = bound * self.forced_slip
+        share = quotient(bound * pull, np.linalg.norm(pull, axis=1, keepdims=True))
+        return -np.einsum("nt,ntg->ng", share, records.tangents)
 
     @cached_property
     def contact_pressure(self) -> Array:

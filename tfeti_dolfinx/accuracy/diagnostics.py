@@ -127,6 +127,7 @@ class Diagnostics:
             *self._rounding(dual, u, rtol),
             *self._turned(u, dual.subdomains),
             *self._facets(solution, dual.subdomains),
+            *_drawn(solution),
             *self._lasting,
             *_of_estimates(outcome),
         ]
@@ -289,6 +290,23 @@ class Diagnostics:
         listed = ", ".join(names[body] for body in some[: LIMITS.listed])
         rest = len(some) - LIMITS.listed
         return f"{listed} and {rest} more" if rest > 0 else listed
+
+
+def _drawn(solution: Solution) -> Iterator[str]:
+    """Nodes that are made to slip along one of two tangents, of which rows know nothing."""
+    if not solution.has_friction:
+        return
+    slip, records = solution.forced_slip, solution.gluing.records
+    drawn = np.any(np.abs(slip) > 0.0, axis=1) & np.any(np.isnan(slip), axis=1)
+    own = records.contact[drawn & (solution.force > 0.0)]
+    count = np.bincount(own, minlength=len(solution.contacts))
+    solution.dofs.comm.Allreduce(MPI.IN_PLACE, count)
+    for i in np.flatnonzero(count):
+        yield (
+            f"{solution.contacts[i].name}: {count[i]} nodes are made to slip along one direction "
+            "and are free along the other: their friction along the first is left out, and that "
+            "along the other may be too large; expected smaller elements there"
+        )
 
 
 def with_estimates(report: Report, numbers: dict[str, float]) -> Report:

@@ -281,16 +281,17 @@ class Gluing:
         return np.asarray(at[np.abs(left[at]) <= rounding[at]])
 
     def forced_slip(self) -> Array:
-        """Return slips that are prescribed as all tangents of a node are, ``(n, gdim - 1)``.
+        """Return slips along tangents that are prescribed, so have no row, ``(n, gdim - 1)``.
 
-        They are those of conditions with friction that have a normal row, and no tangential ones;
-        others are not numbers. Collective.
+        They are those of conditions with friction and a normal row; others are not numbers.
+        Collective.
         """
         along = np.einsum("ntg,ng->nt", self.records.tangents, self._held()[0])
-        forced = self.records.friction != Friction.NONE
-        forced &= np.isin(np.arange(len(forced)), self.contact.condition)
-        forced[self.tangents.condition] = False
-        return np.where(forced[:, None], along - self.slip, np.nan)
+        forced = np.zeros(along.shape, dtype=bool)
+        forced[self.contact.condition] = True
+        forced[self.records.friction == Friction.NONE] = False
+        forced[self.tangents.condition] &= ~self.tangents.moves
+        return np.where(forced, along - self.slip, np.nan)
 
     def _held(self) -> tuple[Array, Array, Array]:
         """Return what prescribed components make of all v_i, and what that leaves of gaps.
