@@ -505,7 +505,7 @@ class Solution:
 
     @cached_property
     def _forced_friction(self) -> Array:
-        """The part of it where all slip is prescribed: rows have no part in that. Collective."""
+        """Its part along what is prescribed, where all slip is: rows have none. Collective."""
         records = self.gluing.records
         if self.friction is None:
             return np.zeros(records.normal.shape)
@@ -513,7 +513,8 @@ class Solution:
         bound = self.friction * given[:, None]
         pull = bound * self.forced_slip
         share = quotient(bound * pull, np.linalg.norm(pull, axis=1, keepdims=True))
-        return -np.einsum("nt,ntg->ng", share, records.tangents)
+        held = self.gluing.prescribed.flag[records.group]
+        return -np.einsum("nt,ntg->ng", share, records.tangents) * held
 
     @cached_property
     def contact_pressure(self) -> Array:
