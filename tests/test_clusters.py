@@ -114,12 +114,9 @@ def test_a_new_stiffness():
     assert apart(*found) <= 1e-7
 
 
-def test_more_clusters_than_subdomains():
+def test_more_clusters_than_subdomains_and_dependent_averages_are_named():
     p = square(8, 2, clusters=5)
     with pytest.raises(InputError, match="5 clusters of 4 subdomains; expected at most"):
         p.solve()
-
-
-def test_averages_that_rounding_makes_dependent_are_named():
     with pytest.raises(FactorError, match="-tfeti_clusters 0"):
         Saddle(np.ones((2, 2)), np.eye(2), np.zeros((2, 0)))

@@ -33,9 +33,6 @@ def test_contacts_by_name_and_by_position(stack):
         assert isinstance(by_name, tfeti.ContactData)
         for field in vars(by_name).keys() - {"resultant"}:
             assert np.array_equal(getattr(by_name, field), getattr(by_position, field)), field
-
-
-def test_a_default_name_has_both_surfaces():
     assert tfeti.Contact("a", 3).name == "contact of 'a' with 3"
     assert tfeti.Obstacle("a", tfeti.Plane((0, 0), (0, 1))).name == "obstacle of surface 'a'"
 

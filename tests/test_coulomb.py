@@ -74,6 +74,29 @@ def test_a_block_that_is_drawn_along_slides_at_its_capacity(comm):
     assert normal == pytest.approx(np.arctan2(-np.sin(angle), -np.cos(angle)), abs=0.02)
 
 
+@pytest.mark.parametrize("law", [tfeti.Coulomb(0.3), tfeti.Tresca(0.003)])
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_a_block_that_is_drawn_by_its_side_rubs_there_too(cell, law, comm):
+    """Drawn to and fro: all of the floor bears its bound, and who draws has it to bear."""
+    d = decomposed(cell, 4, 2)
+    gdim, way = d.mesh.geometry.dim, fem.Constant(d.mesh, 0.0)
+    V, a, L = forms(d.mesh, d.facet_tags, (*(0.0,) * (gdim - 1), -0.01), d.surface("top"))
+    left = fem.locate_dofs_topological(V.sub(0), gdim - 1, d.facets("left"))
+    bcs, options = [fem.dirichletbc(way, left, V.sub(0))], {"rtol": 1e-9}
+    p = tfeti.ContactProblem(a, L, bcs, [floor(gdim, law)], d, petsc_options=options)
+    for way.value, force in ((0.05, -0.003), (-0.05, 0.003), (-0.05, None)):
+        p.solve()
+        data, draws = p.solution.contact(), p.solution.reaction("left").force[0]
+        assert data.resultant.force[0] == pytest.approx(-draws, abs=1e-10)
+        warned = any("5 nodes are made to slip along one" in text for text in p.report.warnings)
+        assert warned == (gdim == 3 and force is not None)
+        if gdim == 2:
+            assert force is None or -draws == pytest.approx(force, rel=1e-6)
+            slides = data.status == tfeti.ContactStatus.SLIP
+            assert comm.allreduce(int(slides.sum())) == (5 if force else 4)
+        p.accept()
+
+
 @pytest.mark.parametrize(
     ("cell", "mu", "tilt", "size", "rtol", "shares", "kind_of"),
     [

@@ -85,11 +85,8 @@ def test_another_problem_is_named(says):
     assert "expected the same problem" in str(found.value)
 
 
-def test_it_is_the_same_on_any_ranks(comm):
+def test_it_is_the_same_on_any_ranks_and_another_mass_is_named(comm):
     check_same_problem(Given(MPI.COMM_SELF, 4).digest(), Given(comm, 4).digest())
-
-
-def test_another_mass_is_named():
     kept, other = (Thrown(n=2, subdomains=2, mass=mass).problem.digest() for mass in (1.0, 2.0))
     with pytest.raises(tfeti.InputError, match=r"mass: constants\[0\] is 2.0, and was 1.0"):
         check_same_problem(kept, other)

@@ -35,11 +35,8 @@ def check_operator(F, comm, size):
         assert abs(one - other) <= 1e-10 * norm_over(comm, Fx) * norm_over(comm, y)
 
 
-def test_F_is_symmetric_and_positive(dual):
+def test_F_and_its_preconditioners_are_symmetric_and_positive(dual):
     check_operator(dual.F, dual.coarse.comm, len(dual.d))
-
-
-def test_preconditioners_are_symmetric_and_positive(dual):
     scaled = scaled_rows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
         check_operator(make(scaled, dual.subdomains), dual.coarse.comm, len(dual.d))

@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
 from tfeti_dolfinx.nonlinear.forms import rotation_free_tangent
+from tfeti_dolfinx.nonlinear.state import InternalVariables
 
 E, NU = 1.0, 0.3
 PLASTIC = {"yield_stress": 0.02, "hardening": 0.1, "saturation": 0.01, "rate": 20.0}
@@ -74,9 +75,7 @@ def test_the_tangent_is_the_derivative_of_the_residual(name, model, selective):
     residual, tangent = assembled(F, u, law), assembled(J, u, law)
     if given:
         residual(0.5 * first)
-        new = {f: tfeti_value(f, value) for f, value in law.state.items()}
-        for function, value in new.items():
-            function.x.array[:] = value
+        InternalVariables(law.state, V.mesh).commit()
         assert np.any(law.p.x.array > 0.0)
     at, h = first + 0.5 * way, 1e-5
     found = tangent(at) @ d
@@ -92,16 +91,6 @@ def test_the_tangent_is_the_derivative_of_the_residual(name, model, selective):
     assert np.abs(K - K.T).max() < 1e-12 * np.abs(K).max()
 
 
-def tfeti_value(function, value):
-    """The new value of an internal variable."""
-    if callable(value) and not isinstance(value, ufl.core.expr.Expr):
-        return value()
-    V, target = function.function_space, fem.Function(function.function_space)
-    points = V.element.interpolation_points
-    target.interpolate(fem.Expression(value, points() if callable(points) else points))
-    return target.x.array
-
-
 @pytest.mark.parametrize("name", LAWS)
 def test_a_small_displacement_is_that_of_linear_elasticity(name):
     kind, given = LAWS[name]
@@ -113,11 +102,7 @@ def test_a_small_displacement_is_that_of_linear_elasticity(name):
     K = assembled(J, u, law)(np.zeros_like(u.x.array))
     expected = fem.assemble_matrix(fem.form(elastic.a(w, v))).to_dense()
     assert np.abs(K - expected).max() < 1e-13
-
-
-@pytest.mark.parametrize("name", LAWS)
-def test_selective_integration_has_the_forces_of_a_homogeneous_strain(name):
-    kind, given = LAWS[name]
+    # and selective integration has the forces of a homogeneous strain
     mesh, found = dmesh.create_unit_cube(MPI.COMM_SELF, 2, 2, 2, dmesh.CellType.hexahedron), []
     elastic = tfeti.Elasticity(mesh, E=E, nu=NU)
     for selective in (False, True):
@@ -133,9 +118,8 @@ def test_selective_integration_has_the_forces_of_a_homogeneous_strain(name):
 def test_neo_hooke_is_that_of_the_reference():
     for model in ("plane_strain", "3d"):
         u = body(model)
-        law = tfeti.NeoHooke(
-            tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model=model), u, degree=4
-        )
+        elastic = tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model=model)
+        law = tfeti.NeoHooke(elastic, u, degree=4)
         v = ufl.TestFunction(u.function_space)
         energy = neo_hooke(u, E, NU) * ufl.dx(metadata={"quadrature_degree": 4})
         u.x.array[:] = 0.1 * np.random.default_rng(2).normal(size=u.x.array.size)
@@ -327,13 +311,30 @@ def test_volumes_that_do_not_fit_are_named(comm):
     halves = {"a": lambda x: x[1] < 1.5, "b": lambda x: x[1] > 1.5}
     cut = torn_boxes("quadrilateral", parts, 2, volumes=halves)
     _, u, v, _ = unknowns(cut)
-    elastic = tfeti.Elasticity(cut, E=E, nu=NU, model="plane_strain")
+    elastic, rings = (tfeti.Elasticity(cut, E=E, nu=NU, model=model) for model in MODELS[:2])
     for said, volumes in {"no volume 'c' .*: 'a'": "c", "expected names or tags": []}.items():
         with pytest.raises(tfeti.InputError, match=said):
             tfeti.NeoHooke(elastic, u, volumes=volumes)
-    some, every = tfeti.NeoHooke(elastic, u, volumes="a"), tfeti.SaintVenantKirchhoff(elastic, u)
-    residuals = {r"J: 4 cells are in no dx; .* without it are: 'b' \(2\)": some.residual(v)}
-    residuals["a SaintV.* of all volumes, and"] = some.residual(v) + every.residual(v)
-    for said, F in residuals.items():
+    names = "a", "b", ["a", "b"], ["b", "a"]
+    a, b, both, again = (tfeti.NeoHooke(elastic, u, volumes=some) for some in names)
+    every, other = tfeti.SaintVenantKirchhoff(elastic, u), tfeti.NeoHooke(elastic, u)
+    yields = [tfeti.J2Plasticity(elastic, u, yield_stress=y) for y in (1.0, 2.0)]
+    dx, strain = ufl.dx(subdomain_data=cut.cell_tags), elastic.strain(v)
+    parts = [ufl.inner(law.stress(u), strain) * dx(k) for k, law in enumerate(yields, 1)]
+    b_linear = a.residual(v) + ufl.inner(elastic.stress(u), strain) * dx(cut.volume("b"))
+    for said, F, *of_finite in (
+        (r"J: 4 cells are in no dx; .* without it are: 'b' \(2\)", a.residual(v)),
+        ("a NeoHooke and a S.*, both in 'a'; expected vol", a.residual(v) + every.residual(v)),
+        ("both in 'a', 'b'; expected volumes=", every.residual(v) + other.residual(v)),
+        ("a NeoHooke and a NeoHooke, both in 'b'; exp", both.residual(v) + b.residual(v)),
+        ("J2Plasticity is of small strain; expected Finite", yields[0].residual(v), elastic),
+        ("small strain does, in volume 'b'; expected one of", b_linear, elastic),
+        ("small strain does, in volume 'a', volume 'b'; exp", elastic.a(u, v), elastic),
+        ("does, in volume 'a', volume 'b'; exp", rings.a(u, v), rings),
+    ):
         with pytest.raises(tfeti.InputError, match=said):
-            tfeti.NonlinearContactProblem(F, u, [], [], cut)
+            more = {"finite": True, "thickness": of_finite[0].thickness} if of_finite else {}
+            tfeti.NonlinearContactProblem(F, u, [], [], cut, **more)
+    for F in (a.residual(v) + b.residual(v), sum(parts), both.residual(v) + again.residual(v)):
+        own = 1e-3 * ufl.inner(u, v) * ufl.dx - v[1] * dx(cut.volume("a"))
+        tfeti.NonlinearContactProblem(F + own, u, [], [], cut)

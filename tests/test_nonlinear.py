@@ -361,7 +361,6 @@ def small(comm):
         ({"F": "dead"}, "F does not depend on u"),
         ({"J": "skew"}, "not symmetric .* or the tangent of an energy"),
         ({"finite": True}, "no J"),
-        ({"finite": True, "J": None}, "takes a rotation for a stretch"),
         ({"state": {1: 2}}, "state: a key"),
         ({"update": 3}, "update"),
         ({"u": None}, "u is"),

@@ -45,13 +45,10 @@ def solved(tmp_path_factory):
     return of
 
 
-def test_numbers_of_subdomains_do_not_matter(serial_only, solved):
+def test_numbers_of_subdomains_do_not_matter_nor_more_ranks_than_these(serial_only, solved):
     few, some, many = (solved(2, f"pair-tetrahedron-{n}") for n in (4, 16, 64))
     for other in (some, many):
         assert relative(other["u"], few["u"]) <= 1e-6
-
-
-def test_more_ranks_than_subdomains(serial_only, solved):
     one, four = solved(1, FEW), solved(4, FEW)
     assert min(one["late"], four["late"]) > 0
     assert relative(four["u"], one["u"]) <= 1e-8

@@ -21,14 +21,11 @@ def run(*arguments, **keywords):
     )
 
 
-def test_a_command_sees_dolfinx_and_this_checkout(findable, tmp_path):
+def test_a_command_sees_dolfinx_and_this_checkout_and_its_exit_status_is_seen(findable, tmp_path):
     code = "import dolfinx, tfeti_dolfinx; print(tfeti_dolfinx.__file__)"
     result = run("python3", "-c", code, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert Path(result.stdout.strip()).parent == ROOT / "tfeti_dolfinx"
-
-
-def test_the_exit_status_is_that_of_the_command(findable):
     assert run("false").returncode == 1
     assert run("python3", "-c", "raise SystemExit(7)").returncode == 7
 

@@ -364,7 +364,7 @@ class ContactProblem:
             thickness=self._thickness,
         )
         solution.boundary = self._system.elements.solved(u)
-        solution.tool_motions = tools.motions()
+        solution.tool_motions, solution.friction = tools.motions(), self._system.known_friction
         return solution
 
     # ------------------------------------------------------- after a solve

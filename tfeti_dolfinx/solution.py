@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
-from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.parallel import any_rank, largest
 from tfeti_dolfinx.constraints.contact_state import (
     ContactData,
     ContactStatus,
@@ -19,8 +19,10 @@ from tfeti_dolfinx.constraints.contact_state import (
     ToolState,
 )
 from tfeti_dolfinx.constraints.gluing import Gluing
+from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
 from tfeti_dolfinx.contact.records import (
+    Friction,
     Resultant,
     body_forces,
     condition_areas,
@@ -98,6 +100,7 @@ class Solution:
         has_contact: True if the problem has contacts.
         has_friction: True if a contact of the problem has friction.
         tool_motions: Where rigid bodies are.
+        friction: Bounds or coefficients of the conditions along tangents, else None.
         thickness: What areas are multiplied with, a number or a scalar in UFL.
         finite: True where forces act at X + u, as in finite strain.
     """
@@ -119,6 +122,7 @@ class Solution:
         self.finite = False
         self.v: Array | None = None
         self.boundary: Any = None
+        self.friction: Array | None = None
         self._stress_of, self.has_stress = stress, stress is not None
         self.has_contact = bool(contacts)
         self.has_friction = any(contact.friction is not None for contact in contacts)
@@ -478,13 +482,39 @@ class Solution:
 
     @cached_property
     def tangential_force(self) -> Array:
-        """Friction on the node of each contact condition of this rank, shape ``(n, gdim)``."""
+        """Friction on the node of each contact condition of this rank, shape ``(n, gdim)``.
+
+        Collective at first use.
+        """
         rows, records = self.gluing.tangents, self.gluing.records
         lam = self.lam[self.gluing.constraints.sets.tangents]
         force = np.zeros(records.normal.shape)
         along = np.einsum("tk,tkg->tg", lam, records.tangents[rows.condition])
         force[rows.condition] = -rows.scale[:, None] * along
-        return force
+        return force + self._forced_friction
+
+    @cached_property
+    def forced_slip(self) -> Array:
+        """Slips along tangents that are prescribed, ``(n, gdim - 1)``. Collective at first use.
+
+        Where they are not, they are no numbers.
+        """
+        slip = self.gluing.forced_slip()
+        slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
+        return slip
+
+    @cached_property
+    def _forced_friction(self) -> Array:
+        """Its part along what is prescribed, where all slip is: rows have none. Collective."""
+        records = self.gluing.records
+        if self.friction is None:
+            return np.zeros(records.normal.shape)
+        given = np.where(records.friction == Friction.COULOMB, self.force, self.area)
+        bound = self.friction * given[:, None]
+        pull = bound * self.forced_slip
+        share = quotient(bound * pull, np.linalg.norm(pull, axis=1, keepdims=True))
+        held = self.gluing.prescribed.flag[records.group]
+        return -np.einsum("nt,ntg->ng", share, records.tangents) * held
 
     @cached_property
     def contact_pressure(self) -> Array:
@@ -544,7 +574,8 @@ class Solution:
         gluing, rows = self.gluing, self.gluing.tangents
         at, end = gluing.constraints.sets.tangents, self._motion[1]
         rubs = np.any(self.lam[at] != 0.0, axis=1) & np.all(self.holding[at] | ~rows.moves, axis=1)
-        kept = np.zeros(end.shape, dtype=bool)
+        forced, kept = gluing.slip + gluing.forced_slip(), np.zeros(end.shape, dtype=bool)
+        end = np.where(np.isnan(forced), end, forced)
         kept[rows.condition] = rubs[:, None] & rows.moves
         return np.where(kept, gluing.slip, end)
 
@@ -558,7 +589,7 @@ class Solution:
 
     @cached_property
     def status_of_conditions(self) -> Array:
-        """ContactStatus of each contact condition of this rank."""
+        """ContactStatus of each contact condition of this rank. Collective at first use."""
         gluing, sets = self.gluing, self.gluing.constraints.sets
         status = np.full(len(gluing.records), ContactStatus.OPEN)
         touching = gluing.contact.condition[self.carrying[sets.normals]]
@@ -570,6 +601,7 @@ class Solution:
         rubbing = np.where(held, ContactStatus.STICK, ContactStatus.SLIP)
         closed = np.isin(rows.condition, np.concatenate((touching, decided)))
         status[rows.condition[closed]] = rubbing[closed]
+        status[np.any(self._forced_friction, axis=1)] = ContactStatus.SLIP
         return status
 
     @cached_property

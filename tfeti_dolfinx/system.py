@@ -232,7 +232,7 @@ class System(Generic[OwnForms]):
         self._K: Any = None
         self._search: ContactSearch | None = None
         self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
-        self._known_friction: Array | None = None
+        self.known_friction: Array | None = None
         self._prescribed: Prescribed | None = None
         self._conditions: list[fem.DirichletBC] | None = None  # that it is of, with their values
         self._values = Data(
@@ -284,12 +284,12 @@ class System(Generic[OwnForms]):
             elif any_rank(comm, not np.array_equal(new.value, old.value)):
                 self.change("right side")
             self._conditions = given
-        if self._search is not None and self._known_friction is not None:
-            known, friction = self._known_friction, self._search.friction()
+        if self._search is not None and self.known_friction is not None:
+            known, friction = self.known_friction, self._search.friction()
             if any_rank(comm, not np.array_equal(friction > 0.0, known > 0.0)):
                 self.change("constraints")
             elif any_rank(comm, not np.array_equal(friction, known)):
-                self._known_friction = friction
+                self.known_friction = friction
                 self.change("friction")
 
     def change(self, what: str) -> None:
@@ -437,7 +437,7 @@ class System(Generic[OwnForms]):
             self.weights = row_weights(self._blocks, scaling, dofs.comm)
         records = search.records
         if self._has_friction:  # a bound of 0 has no rows
-            friction = self._known_friction = search.friction()
+            friction = self.known_friction = search.friction()
             rubs = np.any(friction > 0.0, axis=1)
             records = replace(records, friction=np.where(rubs, records.friction, Friction.NONE))
         self._gluing = glue(
@@ -463,7 +463,7 @@ class System(Generic[OwnForms]):
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
-        constraints, friction = gluing.constraints, made(self._known_friction)
+        constraints, friction = gluing.constraints, made(self.known_friction)
         constraints.limits[:], constraints.coefficients[:] = gluing.tangents.bounds(friction, area)
 
     def _assemble_load(self) -> None:

@@ -27,7 +27,7 @@ from tfeti_dolfinx.constraints.rows import (
     assemble_constraints,
     stack,
 )
-from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
+from tfeti_dolfinx.contact.records import ContactRecords, Friction, relative_motion
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
@@ -279,6 +279,19 @@ class Gluing:
         """Return the conditions that prescribed components decide and that touch. Collective."""
         at, (_, left, rounding) = self.contact.decided, self._held()
         return np.asarray(at[np.abs(left[at]) <= rounding[at]])
+
+    def forced_slip(self) -> Array:
+        """Return slips along tangents that are prescribed, so have no row, ``(n, gdim - 1)``.
+
+        They are those of conditions with friction and a normal row; others are not numbers.
+        Collective.
+        """
+        along = np.einsum("ntg,ng->nt", self.records.tangents, self._held()[0])
+        forced = np.zeros(along.shape, dtype=bool)
+        forced[self.contact.condition] = True
+        forced[self.records.friction == Friction.NONE] = False
+        forced[self.tangents.condition] &= ~self.tangents.moves
+        return np.where(forced, along - self.slip, np.nan)
 
     def _held(self) -> tuple[Array, Array, Array]:
         """Return what prescribed components make of all v_i, and what that leaves of gaps.

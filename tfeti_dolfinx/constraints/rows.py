@@ -28,6 +28,8 @@ class RowTolerances:
     # plane of symmetry, where nothing slips across, neighbours that do not match leave a rest that
     # hardly moves but would take friction; a body that is free leaves a half
     little_left: float = 0.25
+    # of the largest displacement: a slip that is prescribed, and less, is none, as solves leave it
+    still: float = 1e-6
     # overlap, over the scene's length, that rounding of gaps and prescribed values may leave
     overlap: float = 1e-10
 

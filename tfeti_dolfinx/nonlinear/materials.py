@@ -5,12 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any, TypeAlias
 
 import basix.ufl
 import numpy as np
 import ufl
 from dolfinx import fem
+from ufl.algorithms import extract_coefficients
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
@@ -225,13 +227,25 @@ class Material(ABC):
         return stress if self._inside is None else self._inside * stress
 
 
-def laws_of(F: ufl.Form, update: Any, u: fem.Function) -> list[Material]:
+def laws_of(
+    F: ufl.Form, update: Any, u: fem.Function, finite: bool, decomposition: Decomposition
+) -> list[Material]:
     """Return the laws of u in a residual, and the one whose method ``update`` is.
 
-    Raise an InputError where that is of another displacement, or volumes are not told apart.
+    Raise an InputError where that is of another displacement, a law is of small strain though the
+    problem is ``finite``, or laws are in the same volumes, as where ``volumes`` was forgotten. Laws
+    that have the same ``volumes`` given, or are in one integral, are taken to act in parallel.
     """
-    found = [getattr(f, "law", None) for f in F.coefficients()]
-    laws = dict.fromkeys(law for law in found if isinstance(law, Material) and law.u is u)
+    found: list[tuple[Material, int, set[Any]]] = []  # a law, its integral, tags there
+    names = {tag: repr(name) for name, tag in decomposition.names.volumes.items()}
+    for k, part in enumerate(F.integrals()):
+        tags: set[Any] = set(np.atleast_1d(part.subdomain_id()).tolist())
+        if "everywhere" in tags or part.subdomain_data() is not decomposition.cell_tags:
+            tags = set(names) if "everywhere" in tags else set()
+        for law in (getattr(f, "law", None) for f in extract_coefficients(part.integrand())):
+            if isinstance(law, Material) and law.u is u:
+                found.append((law, k, tags.intersection(law.volumes or names)))
+    laws = dict.fromkeys(law for law, _, _ in found)
     if isinstance(law := getattr(update, "__self__", None), Material):
         if law.u is not u:
             raise InputError(
@@ -239,12 +253,19 @@ def laws_of(F: ufl.Form, update: Any, u: fem.Function) -> list[Material]:
                 "one that was made with u"
             )
         laws[law] = None
-    everywhere = [law for law in laws if law.volumes is None]
-    if everywhere and len(everywhere) < len(laws):
+    if finite and any(isinstance(law, J2Plasticity) for law in laws):
         raise InputError(
-            f"F has a {type(everywhere[0]).__name__} of all volumes, and another law of some; "
-            "expected volumes= of both"
+            "finite=True: J2Plasticity is of small strain; expected FiniteJ2Plasticity"
         )
+    for (one, j, here), (other, k, there) in combinations(found, 2):
+        meant = one is other or j == k or one.volumes == other.volumes is not None
+        if here & there and not meant and (len(names) > 1 or one.volumes or other.volumes):
+            where = ", ".join(names[tag] for tag in sorted(here & there))
+            raise InputError(
+                f"F has a {type(one).__name__} and a {type(other).__name__}, both in {where}; "
+                "expected volumes= of both with none in common, or the same where laws act in "
+                "parallel"
+            )
     return list(laws)
 
 

@@ -9,8 +9,8 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.common.agreement import agreeing
-from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sums
-from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering
+from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sum_rows, sums
+from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
@@ -130,7 +130,8 @@ class NonlinearContactProblem(ContactProblem):
                         f"{contact.name}: a given gap with finite=True; "
                         'expected gap="geometry" or "curved"'
                     )
-            laws, self._has_own_tangent = laws_of(F, update, u), J is not None
+            laws = laws_of(F, update, u, finite, decomposition)
+            self._has_own_tangent = J is not None
             if finite:
                 J = rotation_free_tangent(F, u)
             elif J is None:
@@ -319,20 +320,44 @@ class NonlinearContactProblem(ContactProblem):
         u, forms = np.array(self.u.x.array), self._system.forms
         c, s = np.cos(self._tolerances.turned) - 1.0, np.sin(self._tolerances.turned)
         moved, gdim, found = fem.Function(self.u.function_space), len(self.u), list[Array]()
-        for a, b in ((0.0, 0.0), (c, 0.0), (c, s)):
+        for a, b in ((0.0, 0.0), (c, 0.0), (c, s), (2 * c, 0.0)):
             way = np.array([[a, -b, 0.0], [b, a, 0.0], [0.0, 0.0, 0.0]])[:gdim]
             moved.interpolate(lambda x, A=way: A @ x)
             self._set(moved.x.array)
             found.append(forms.residual())
         self._set(u)
-        apart, stretch = found[2] - found[1], found[1] - found[0]
-        apart, size = np.sqrt(dot_over(self.decomposition.comm, (apart, apart), (stretch, stretch)))
-        if apart <= self._tolerances.alike * size:
+        size, *apart = self._by_volumes(
+            found[1] - found[0],
+            found[2] - found[1],
+            found[3] - 2 * found[1] + found[0],  # of bodies that are linear: rings do not turn
+        )
+        seen = size > self._tolerances.rounding * size.max()
+        if np.any(small := seen & (np.min(apart, axis=0) <= self._tolerances.alike * size)):
+            names = [f"volume {name!r}" for name in self.decomposition.names.volumes]
+            where = dict.fromkeys(names[k - 1] for k in np.nonzero(small)[1] if k)
             raise InputError(
-                "finite=True: the residual F takes a rotation for a stretch, as small strain does; "
-                "expected one of finite strain, for instance the derivative of an energy of "
-                "I + grad(u)"
+                "finite=True: the residual F takes a rotation for a stretch, as small strain does"
+                f"{', in ' * bool(where)}{', '.join(where)}; expected one of finite strain, for "
+                "instance the derivative of an energy of I + grad(u)"
             )
+
+    def _by_volumes(self, *forces: Array) -> Array:
+        """Return norms of forces at the nodes of each body and volume, (bodies, 1 + volumes).
+
+        Nodes of no volume, or of several, are those of column 0. Collective.
+        """
+        d, dofs = self.decomposition, np.asarray(self.u.function_space.dofmap.list)
+        columns = 1 + len(d.names.volumes)
+        of = columns * d.body_of_subdomain[d.cell_subdomain]
+        for k, tag in enumerate(d.names.volumes.values()):
+            of[d.cells(tag)] += k + 1
+        at = np.zeros(len(self.u.x.array) // len(self.u), int)
+        at[dofs] = of[:, None]
+        shared = dofs[at[dofs] != of[:, None]]
+        at[shared] -= at[shared] % columns
+        squares = np.stack([np.sum(f.reshape(-1, len(self.u)) ** 2, axis=1) for f in forces], 1)
+        found = summed(d.comm, sum_rows(at, squares, d.num_bodies * columns))
+        return np.sqrt(found.T).reshape(-1, d.num_bodies, columns)
 
     def _solve_linearised(self, rtol: float, warns: bool) -> None:
         """Solve the contact problem of the model at u; the last one warns. Collective.
