@@ -42,6 +42,19 @@ def test_free_flight_is_exact(cell, stabilised):
     assert largest(v[:, -1] + 0.3 + 0.5 * 0.5) <= 1e-12
 
 
+def test_the_mass_of_a_ring_is_that_of_its_radius():
+    """The kinetic energy of the velocity (r, 0) of a cone of radius R(z) is π/4 ∫R⁴."""
+    d = decomposed("triangle", 2, 2)
+    d.mesh.geometry.x[:, 0] *= 1.0 + 0.5 * d.mesh.geometry.x[:, 1]
+    law, (V, u, v) = tfeti.Elasticity(d, E=1.0, nu=0.3, model="axisymmetric"), vectors(d)
+    grows = fem.Function(V)
+    grows.interpolate(lambda x: np.stack((x[0], 0.0 * x[0])))
+    given = {"mass": 1.0, "velocity": grows, "thickness": law.thickness}
+    p = tfeti.ContactDynamics(law.a(u, v), ufl.ZeroBaseForm((v,)), [], [], d, **given)
+    (record,) = tfeti.LoadSteps(p, lambda p, t: None, [1e-6]).run()
+    assert record.motion["kinetic"] == pytest.approx(np.pi / 10 * (1.5**5 - 1), rel=1e-5)
+
+
 @pytest.mark.parametrize(
     ("cell", "below", "stabilised"), [("triangle", True, True), ("tetrahedron", False, False)]
 )

@@ -234,9 +234,7 @@ def mass_form(
     degree = V.element.basix_element.degree
     if lumped and degree != 1:
         raise InputError(f"lumped=True on elements of degree {degree}; expected degree 1")
-    rule = {"quadrature_degree": 2 * degree}
-    if lumped:
-        rule = {"quadrature_rule": "vertex", "quadrature_degree": 1}
+    rule = {"quadrature_rule": "vertex", "quadrature_degree": 1} if lumped else None
     dx = ufl.Measure("dx", domain=decomposition.mesh, metadata=rule)
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     product = rho * ufl.inner(u, v)
