@@ -216,12 +216,10 @@ def test_a_solver_that_is_missing_is_named():
     assert not PETSc.Options().hasName(name)
 
 
-def test_a_value_that_petsc_cannot_read():
+def test_values_that_petsc_cannot_read_and_factors_without_memory_are_named():
     with pytest.raises(FactorError, match=r"-tfeti_sub_\.\.\., .* abc has no numeric value"):
         problem(decomposed("triangle"), tfeti_sub_pc_factor_fill="abc").solve()
 
-
-def test_a_factor_without_memory_is_named():
     class NoMemory(PETSc.Error):
         ierr = factor.PetscError.OUT_OF_MEMORY
 

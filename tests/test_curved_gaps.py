@@ -84,9 +84,7 @@ def test_facets_that_miss_each_other_are_warned_of():
     p = pin_in_lug((3.0, 0.75))
     assert not np.any(force_and_peak(p))
     assert any(text.startswith(SAYS) and "together by 0;" in text for text in p.report.warnings)
-
-
-def test_pressures_of_nodes_that_are_hardly_covered_do_not_hide_facets():
+    # pressures of nodes that are hardly covered do not hide them
     p = solved(pin_in_lug((3.0, 2.0), thickness=6.0, layers=2, thin=0.53))
     (warning,) = p.report.warnings
     assert warning.startswith(SAYS)

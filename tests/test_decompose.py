@@ -47,16 +47,14 @@ def test_the_boundary_is_the_exterior_without_the_tears():
     assert np.array_equal(np.union1d(d.tears, d.boundary), np.sort(exterior))
 
 
-def test_subdomains_do_not_depend_on_the_ranks():
+def test_subdomains_do_not_depend_on_the_ranks_and_each_is_on_one():
     d = decomposed("tetrahedron", n=4, subdomains=7)
     alone = decomposed("tetrahedron", n=4, subdomains=7, comm=MPI.COMM_SELF)
     ids, subdomains = cells_of(d)
     ids_alone, subdomains_alone = cells_of(alone)
     assert np.array_equal(ids, ids_alone)
     assert np.array_equal(subdomains, subdomains_alone)
-
-
-def test_a_subdomain_is_on_one_rank_and_ranks_have_about_equal_shares():
+    # ranks have about equal shares
     d = decomposed("hexahedron", n=6, subdomains=24)
     lists = d.comm.allgather(d.subdomains.tolist())
     assert sorted(s for part in lists for s in part) == list(range(24))

@@ -17,14 +17,11 @@ from tfeti_dolfinx.solve.solver import resolved
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_values_get_the_type_of_their_option():
+def test_values_get_the_type_of_their_option_and_the_command_line_beats_the_dictionary():
     assert parse_options(None, "tfeti_") == Options()
     given = {"tfeti_rtol": "1e-8", "max_it": "7", "-tfeti_monitor": None, "view": "false"}
     options = parse_options(given, "tfeti_")
     assert (options.rtol, options.max_it, options.monitor, options.view) == (1e-8, 7, True, False)
-
-
-def test_the_command_line_beats_the_dictionary():
     database = PETSc.Options()
     database.setValue("-tfeti_rtol", "1e-3")
     try:

@@ -36,14 +36,10 @@ def test_stiffnesses_are_on_the_arrays_of_petsc_and_hold_their_kernels_once(scen
         assert np.shares_memory(block.kernel, block.stiffness.kernel)
 
 
-def test_energies(scene):
+def test_energies_and_kernel_motions(scene):
     p, subdomains = scene
     u = random(num_dofs(p))
     assert np.sum(subdomains.energies(u)) == pytest.approx(u @ multiplied(p, u), rel=1e-12)
-
-
-def test_kernel_motions_cost_nothing(scene):
-    p, subdomains = scene
     alpha = random(subdomains.kernel_rows.shape[1])
     motion = subdomains.kernel_motion(alpha)
     assert np.abs(multiplied(p, motion)).max(initial=0.0) <= 1e-12
