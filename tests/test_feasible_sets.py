@@ -88,9 +88,8 @@ def touching(self, x, g):
     return Face(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING), beta=0.0 * g)
 
 
-def inward(self, x, g):
-    face = Bounds.face(self, x, g)
-    return replace(face, beta=-face.beta)
+def never(self, x, g):
+    return replace(Bounds.face(self, x, g), beta=0.0 * g)
 
 
 def below(self, x, status):
@@ -110,7 +109,7 @@ WRONG = [
         broken(project=lambda self, x: np.where(x > 0, x, x / 2)),
     ),
     ("largest step", broken(max_step=lambda self, x, p: 2.0 * Bounds.max_step(self, x, p))),
-    (r"φ \+ β is the projected gradient", broken(face=inward)),
+    (r"φ \+ β is the projected gradient", broken(face=never)),
     ("open rows are not in Z", broken(face=free_or_not(np.ones))),
     (r"x \+ Zt stays in Ω", broken(face=touching)),
     ("rows that are held are free in Z", broken(face=free_or_not(np.zeros))),

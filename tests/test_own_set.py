@@ -35,12 +35,10 @@ class HalfSpaces:
 
 class WithSplit(HalfSpaces):
     def split(self, x, g):
-        face = super().face(x, g)
-        return np.where(face.free, g, 0.0), face.beta
+        return np.where(self._bound(x), 0.0, g), super().face(x, g).beta
 
     def face(self, x, g):
-        face = super().face(x, g)
-        return Face(face.free, face.status)
+        return Face(~self._bound(x), super().face(x, g).status)
 
 
 KINDS = pytest.mark.parametrize("kind", [HalfSpaces, WithSplit])
