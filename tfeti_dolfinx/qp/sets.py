@@ -245,8 +245,8 @@ class Product:
         width = max(tangents.shape[1] for _, tangents, _ in found)
         tables = []
         for at, tangents, kappa in found:
-            wider = ((0, 0), (0, width - tangents.shape[1]))
-            tables.append((np.pad(at, wider), np.pad(tangents, wider), kappa))
+            none = np.zeros((len(at), width - at.shape[1]), dtype=at.dtype)
+            tables.append((np.hstack((at, none)), np.hstack((tangents, none)), kappa))
         at, tangents, kappa = map(np.concatenate, zip(*tables, strict=True))
         return Face(free, status, at, tangents, kappa, beta)
 
@@ -326,12 +326,12 @@ class Ellipses:
         if self.semi_axes.shape[1] != 2 or not len(along):
             return face
         # κ = (−nᵀg)⁺ τᵀHτ/‖Ht‖ with H = diag(a)⁻² and τ the tangent
-        n = normal[along]
-        slope = np.linalg.norm(self._inverse**2 * t, axis=1)
-        bent = np.sum(self._inverse**2 * normal[:, ::-1] ** 2, axis=1)
-        kappa = pushing * quotient(bent, slope)
+        n, H = normal[along], self._inverse[along] ** 2
+        slope = np.linalg.norm(H * t[along], axis=1)
+        bent = np.sum(H * n[:, ::-1] ** 2, axis=1)
+        kappa = pushing[along] * quotient(bent, slope)
         rows, tangents = 2 * along[:, None] + (0, 1), np.stack((-n[:, 1], n[:, 0]), axis=1)
-        return replace(face, tangent_rows=rows, tangents=tangents, curvature=kappa[along])
+        return replace(face, tangent_rows=rows, tangents=tangents, curvature=kappa)
 
     def onto(self, x: Array, status: Array) -> Array:
         """The nearest points of the ellipses; of their boundary, from inside too, for slip."""
