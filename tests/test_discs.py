@@ -85,10 +85,9 @@ def test_intervals_are_bounds_from_both_sides():
     intervals = discs(np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 1)
     assert np.array_equal(intervals.project(x), [-1.0, -0.5, 0.5, 1.0, 0.0])
     y, g = intervals.project(x), np.array([1.0, 1.0, 1.0, 1.0, 1.0])
-    phi, beta = intervals.split(y, g)
-    assert np.array_equal(phi, [0.0, 1.0, 1.0, 0.0, 0.0])
-    assert np.array_equal(beta, [0.0, 0.0, 0.0, 1.0, 0.0])  # at −1 it pushes outwards
     face = intervals.face(y, g)
+    assert np.array_equal(face.free, [0.0, 1.0, 1.0, 0.0, 0.0])
+    assert np.array_equal(face.beta, [0.0, 0.0, 0.0, 1.0, 0.0])  # at −1 it pushes outwards
     slip, stick, fixed = Status.SLIP, Status.STICK, Status.OPEN
     assert face.status.tolist() == [slip, stick, stick, slip, fixed]
     assert face.Z.toarray().tolist() == [[0, 0], [1, 0], [0, 1], [0, 0], [0, 0]]
@@ -105,10 +104,9 @@ def test_what_is_projected_is_on_the_boundary(seed):
     outside = level(a, z) > 1.0
     ellipses = Ellipses(a)
     x = ellipses.project(z.ravel())
-    status = ellipses.face(x, np.zeros(20)).status.reshape(-1, 2)
-    assert np.all((status == Status.SLIP) == outside[:, None])
-    phi, _ = ellipses.split(x, np.ones(20))
-    assert np.array_equal(phi.reshape(-1, 2) == 0.0, np.repeat(outside[:, None], 2, axis=1))
+    face = ellipses.face(x, np.ones(20))
+    assert np.all((face.status.reshape(-1, 2) == Status.SLIP) == outside[:, None])
+    assert np.array_equal(face.free, np.repeat(~outside, 2))
 
 
 @given(SEEDS)

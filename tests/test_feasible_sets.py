@@ -72,20 +72,24 @@ def scaled(self, x, g):
     face = Bounds.face(self, x, g)
     rows = np.flatnonzero(face.free)[:, None]
     twice, flat = np.full(rows.shape, 2.0), np.zeros(len(rows))
-    return Face(np.zeros_like(face.free), face.status, rows, twice, flat)
+    return Face(np.zeros_like(face.free), face.status, rows, twice, flat, face.beta)
 
 
 class WithoutOnto:
-    project, split, max_step, face = Bounds.project, Bounds.split, Bounds.max_step, Bounds.face
+    project, max_step, face = Bounds.project, Bounds.max_step, Bounds.face
 
 
 def free_or_not(make):
     """A face whose rows are all free, or none."""
-    return lambda self, x, g: Face(make(len(x), dtype=bool), Bounds.face(self, x, g).status)
+    return lambda self, x, g: replace(Bounds.face(self, x, g), free=make(len(x), dtype=bool))
 
 
 def touching(self, x, g):
-    return Face(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING))
+    return Face(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING), beta=0.0 * g)
+
+
+def never(self, x, g):
+    return replace(Bounds.face(self, x, g), beta=0.0 * g)
 
 
 def below(self, x, status):
@@ -105,10 +109,7 @@ WRONG = [
         broken(project=lambda self, x: np.where(x > 0, x, x / 2)),
     ),
     ("largest step", broken(max_step=lambda self, x, p: 2.0 * Bounds.max_step(self, x, p))),
-    (
-        "φ \\+ β is the projected gradient",
-        broken(split=lambda self, x, g: np.multiply(Bounds.split(self, x, g), [[1.0], [-1.0]])),
-    ),
+    (r"φ \+ β is the projected gradient", broken(face=never)),
     ("open rows are not in Z", broken(face=free_or_not(np.ones))),
     (r"x \+ Zt stays in Ω", broken(face=touching)),
     ("rows that are held are free in Z", broken(face=free_or_not(np.zeros))),

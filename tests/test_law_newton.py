@@ -12,31 +12,12 @@ from test_mpgp import as_set
 from test_qp import matrix, vector
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.qp.coarse import DenseCoarse
+from tfeti_dolfinx.qp.coarse import Coarse, DenseCoarse
 from tfeti_dolfinx.qp.friction_newton import Law, LawPoint, LawProgram, newton_on_law
 from tfeti_dolfinx.qp.problem import QP
 
 SEEDS = st.integers(0, 1000)
 DIMENSIONS = st.sampled_from([1, 2])
-
-
-class DenseOblique:
-    """P, H of a dense G, by the formulas."""
-
-    def __init__(self, G, face, C):
-        self.ZZ = (face.Z @ face.Z.T).toarray()
-        self.follows = G @ (self.ZZ + C @ self.ZZ)
-        self.Gt = self.ZZ @ G.T
-        self.H = np.linalg.pinv(self.follows @ G.T)
-
-    def coordinates(self, x):
-        return self.H @ (self.follows @ x)
-
-    def project(self, x):
-        return self.ZZ @ x - self.Gt @ self.coordinates(x)
-
-    def restoring(self, y):
-        return self.Gt @ (self.H @ y)
 
 
 def program(seed, k, r, points=8, m=40):
@@ -66,7 +47,8 @@ def solve(F, d, G, e, law, target=1e-10):
     qp = QP(matrix(F), vector(d), coarse, law.at(np.ones(len(law.normals))))
 
     def oblique(face, C):
-        return DenseOblique(G, face, C)
+        H = np.linalg.pinv(G @ C.followed(face.restricted(G.T)))
+        return Coarse(coarse.comm, coarse.Gt, e, H.__matmul__, face, C.followed)
 
     program = LawProgram(qp, law, oblique, 3.0)
     zero = LawPoint(np.zeros(len(d)), -d, np.zeros(len(e)))

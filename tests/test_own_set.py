@@ -20,31 +20,40 @@ class HalfSpaces:
     def _bound(self, x):
         return self.a * x >= self.b - 1e-14 * np.abs(self.b)
 
-    def split(self, x, g):
-        bound = self._bound(x)
-        return np.where(bound, 0.0, g), np.where(bound, np.minimum(g, 0.0), 0.0)
-
     def max_step(self, x, p):
         down = self.a * p < 0.0
         return np.min((self.a * x - self.b)[down] / (self.a * p)[down], initial=np.inf)
 
     def face(self, x, g):
         off = ~self._bound(x)
-        return Face(off, np.where(off, Status.TOUCHING, Status.OPEN))
+        beta = np.where(off, 0.0, np.minimum(g, 0.0))
+        return Face(off, np.where(off, Status.TOUCHING, Status.OPEN), beta=beta)
 
     def onto(self, x, status):
         return np.where(status == Status.OPEN, self.b / self.a, self.project(x))
 
 
-def test_it_conforms():
-    check_feasible_set(HalfSpaces(-np.arange(1.0, 11.0), np.linspace(-1.0, 2.0, 10)), 10)
+class WithSplit(HalfSpaces):
+    def split(self, x, g):
+        return np.where(self._bound(x), 0.0, g), super().face(x, g).beta
+
+    def face(self, x, g):
+        return Face(~self._bound(x), super().face(x, g).status)
 
 
-def glued(cell, n, subdomains, limit):
+KINDS = pytest.mark.parametrize("kind", [HalfSpaces, WithSplit])
+
+
+@KINDS
+def test_it_conforms(kind):
+    check_feasible_set(kind(-np.arange(1.0, 11.0), np.linspace(-1.0, 2.0, 10)), 10)
+
+
+def glued(cell, n, subdomains, limit, kind=HalfSpaces):
     """A box whose contact pulls up to the limit that a function says."""
 
     def pulling(constraints):
-        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), limit()))
+        half_spaces = kind(-constraints.scale, np.full(len(constraints.scale), limit()))
         return Product([(constraints.sets.normals, half_spaces)])
 
     d = decomposed(cell, n, subdomains)
@@ -53,9 +62,10 @@ def glued(cell, n, subdomains, limit):
     return problem(d, contacts=[obstacle], extensions=own, rtol=1e-9)
 
 
+@KINDS
 @pytest.mark.parametrize("limit", [1e-4, 1e6])
-def test_glue_that_lets_go_at_a_limit(limit):
-    p = glued("hexahedron", 4, 6, lambda: limit)
+def test_glue_that_lets_go_at_a_limit(limit, kind):
+    p = glued("hexahedron", 4, 6, lambda: limit, kind)
     noise = 1e-7 * p.solve().x.petsc_vec.norm(3)
     rows = p.solution.gluing.contact.condition
     force, gap = p.solution.force[rows], p.solution.remaining_gap[rows]

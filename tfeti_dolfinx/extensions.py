@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.problem import Monitor
-from tfeti_dolfinx.qp.sets import FeasibleSet, Status
+from tfeti_dolfinx.qp.sets import FeasibleSet, Status, face_at
 from tfeti_dolfinx.subdomains.block import PROMISED, Block, SubdomainData
 from tfeti_dolfinx.subdomains.kplus import MakeInverse
 from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod, Subdomains
@@ -145,16 +145,16 @@ def _on_all_rows(law: FeasibleLaw) -> FeasibleLaw:
 
     def checked(constraints: Constraints) -> FeasibleSet:
         made, zero = law(constraints), np.zeros(constraints.num_rows)
-        projected = np.shape(made.project(zero)) if hasattr(made, "project") else zero.shape
-        if projected != zero.shape:
+        if not (hasattr(made, "project") and hasattr(made, "face")):
+            return made  # what lacks a part is named by all ranks
+        if (projected := np.shape(made.project(zero))) != zero.shape:
             raise InputError(
                 f"extensions: feasible_set projects vectors of shape {zero.shape} to {projected}; "
                 "expected a set on all constraints of this rank, say a Product of sets on "
                 "constraints.sets.normals"
             )
-        tangents = constraints.sets.tangents
-        looked = tangents.size and hasattr(made, "face") and hasattr(made, "project")
-        if looked and Status.FREE in made.face(made.project(zero), zero).status[tangents]:
+        face = face_at(made, made.project(zero), zero)
+        if Status.FREE in face.status[constraints.sets.tangents]:
             raise InputError(
                 "extensions: feasible_set leaves multipliers of friction free, which glues; "
                 "expected a set on constraints.sets.tangents, say Ellipses(constraints.limits)"

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.errors import require
-from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
+from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, face_at
 from tfeti_dolfinx.subdomains.block import (
     PROMISED,
     Block,
@@ -48,10 +48,10 @@ TOLERANCES = CheckTolerances()
 def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
     """Check what solvers rely on, at random points of any feasible set.
 
-    The projection is idempotent and the nearest point; a maximal step stays in the set; the
-    projected gradient is how a projected step moves; a face has orthonormal directions, along
-    which a point may move to both sides, and its curvature and its statuses are right; ``onto``
-    keeps open rows open and slipping ones on their boundary.
+    The projection is idempotent and the nearest point; a face has orthonormal directions, along
+    which a point may move to both sides, and its curvature, its statuses and its β are right, φ + β
+    being how a projected step moves; a maximal step stays in the set; ``onto`` keeps open rows open
+    and slipping ones on their boundary.
 
     Args:
         feasible: The set; an object of any class.
@@ -60,6 +60,7 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
 
     Raises:
         ConformanceError: Something of that does not hold; the message says what.
+        InputError: There is no β for each row.
     """
     promised = [name for name in dir(FeasibleSet) if name[0] != "_"]
     missing = [name for name in promised if not hasattr(feasible, name)]
@@ -73,8 +74,12 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
         least = 1e-12 * (1.0 + np.linalg.norm(start - x) * np.linalg.norm(y - x))
         require(obtuse <= least, "P(x) is the nearest point of Ω")
         require(_close(feasible.project(x), x, 1e-14), "P(P(x)) = P(x)")
+        # the face
+        face = face_at(feasible, x, g)
+        _check_face(face, size)
+        _check_moves(feasible, x, x - start, rng.standard_normal(face.Z.shape[1]))
         # gradients
-        phi, beta = feasible.split(x, g)
+        phi, beta = np.where(face.free, g, 0.0), face.beta
         far = x - min(feasible.max_step(x, phi), 1e3) * phi
         require(_close(feasible.project(far), far, 1e-10), "x − αφ ∈ Ω for the largest step α")
         length = 1.0 + np.linalg.norm(phi + beta)
@@ -84,12 +89,8 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
             for d, a in zip(apart, TOLERANCES.shorter, strict=True)
         ]
         require(any(right), "φ + β is the projected gradient")
-        # the face
-        _check_face(feasible.face(x, g), size)
-        t = rng.standard_normal(feasible.face(x, g).Z.shape[1])
-        _check_moves(feasible, x, x - start, t)
         # open and slipping rows stay so, wherever others go
-        status = feasible.face(x, g).status
+        status = face.status
         free = np.full(size, Status.FREE)
         require(_close(feasible.onto(other, free), y, 1e-12), "onto without bounds is P_Ω")
         onto = feasible.onto(other, status)

@@ -1,5 +1,7 @@
 """Mistakes in parts of one's own."""
 
+from dataclasses import replace
+
 import numpy as np
 from mpi4py import MPI
 
@@ -32,6 +34,13 @@ class OfThree:
         return np.zeros(len(x) + 1)
 
 
+class WithoutBeta(Bounds):
+    """A set whose faces do not say which rows want to become free."""
+
+    def face(self, x, g):
+        return replace(super().face(x, g), beta=np.zeros(len(x) + 1))
+
+
 def normals_alone(s):
     """A set that forgets friction."""
     rough = Obstacle("bottom", s.floor.shape, friction=Tresca(0.1))
@@ -58,6 +67,7 @@ RUN = {
     ),
     r"extensions: feasible_set projects vectors of shape \(\d+,\) to \(\d+,\); expected a set "
     r"on all constraints of this rank": own(feasible_set=lambda constraints: OfThree()),
+    "beta of WithoutBeta has shape .*; exp": own(feasible_set=lambda B: WithoutBeta()),
     r"extensions: feasible_set leaves multipliers of friction free": normals_alone,
     r"extensions: monitor: ZeroDivisionError: no such place": own(monitor=on_the_last_rank),
 }

@@ -19,7 +19,7 @@ from tfeti_dolfinx.feti.projectors import (
     FaceFactors,
     Grams,
     NullModes,
-    ObliqueProjectors,
+    ObliqueFactor,
     SemidefiniteFactor,
 )
 from tfeti_dolfinx.feti.rigid_bodies import (
@@ -195,13 +195,16 @@ class CoarseSpace(Coarse):
         known.e = self.e
         return known
 
-    def oblique(self, face: Face, C: Following) -> ObliqueProjectors:
+    def oblique(self, face: Face, C: Following) -> Coarse:
         """Return the projectors on a face of the rows where others follow: λ = (I + C)u.
 
         Raise a FactorError where forces on the face do not determine what balances a load.
         """
         self.factors.count += int(self.dimension > 0)
-        return ObliqueProjectors(self.grams, self.rows, face, C, self.factors.null)
+        factor = ObliqueFactor(self.grams, face, C, self.factors.null)
+        made = Coarse(self.comm, self.Gt, self.e, factor.solve, face, C.followed)
+        made.rows = self.rows
+        return made
 
     def rows_driven(self, free: Motions) -> Array:
         """Return local rows that act on bodies which the load drives along free motions."""

@@ -215,29 +215,20 @@ def _scaled(A: csr_array, scale: Array, pinned: Array) -> Entries:
     return plus(Entries(data, A.indices, A.indptr, A.shape), at, at, pinned[at])
 
 
-# --- Oblique projectors -----------------------------------------------------------------------
+class ObliqueFactor:
+    """H⁺ of H = G(I + C)ZG_fᵀ, of a face and C, led by rows that move on their own. Collective.
 
-
-class ObliqueProjectors:
-    """P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ with H = G(I + C)ZG_fᵀ, of a face and C. Collective.
-
-    λ = (I + C)u moves with u in the face, C led by rows that are directions of their own (normals):
-    G(I + C)u = 0 for u = Pv, and P makes nothing of what G_fᵀ gives. With C = 0 it is the
-    orthogonal projector of the face. H is G_fG_fᵀ and a part that has the same null space; scaled
-    and pinned as in ``SemidefiniteFactor``. Creation raises a FactorError where H is singular.
+    H is G_fG_fᵀ and a part that has the same null space; scaled and pinned as in
+    ``SemidefiniteFactor``. Creation raises a FactorError where H is singular.
     """
 
-    def __init__(
-        self, grams: Grams, rows: LocalMatrix, face: Face, C: Following, null: NullModes
-    ) -> None:
-        self._comm, self._face, self._null, self._C = grams.comm, face, null, C
-        self._rows, led = rows, C.ratios * face.free[C.leaders]
-        followed = rows_of(grams.Gt, C.leaders, led).csr()
-        of_C = transposed(rows_of(grams.Gt, C.rows)).csr() @ followed
-        A, N = grams.of_face(face), replicated(of_C, self._comm)
+    def __init__(self, grams: Grams, face: Face, C: Following, null: NullModes) -> None:
+        led = rows_of(grams.Gt, C.leaders, C.ratios * face.free[C.leaders]).csr()
+        of_C = transposed(rows_of(grams.Gt, C.rows)).csr() @ led
+        A, N = grams.of_face(face), replicated(of_C, grams.comm)
+        self._null, self._factor = null, None
         self._scale, pinned = _scaling(A, null)
-        self._factor = None
-        with raised_on_all_ranks(self._comm):
+        with raised_on_all_ranks(grams.comm):
             try:
                 if A.shape[1]:
                     H = _scaled(A + N, self._scale, pinned)
@@ -246,25 +237,12 @@ class ObliqueProjectors:
             except RuntimeError as error:
                 raise FactorError(f"active set with friction: coarse problem: {error}") from error
 
-    def _solve(self, y: Array) -> Array:
+    def solve(self, y: Array) -> Array:
         """H⁺y without null modes, for y orthogonal to them; shape ``(r,)`` or ``(r, q)``."""
         if self._factor is None:
             return y
         x = self._factor.solve((self._scale * self._null.removed(y).T).T, "T")
         return self._null.removed((self._scale * x.T).T)
-
-    def coordinates(self, x: Array) -> Array:
-        """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
-        own = self._face.restricted(x)
-        return self._solve(summed(self._comm, self._rows.transposed(own + self._C @ own)))
-
-    def project(self, x: Array) -> Array:
-        """P x, shapes ``(m_local,)`` or ``(m_local, q)``. Collective."""
-        return self._face.restricted(x - self._rows @ self.coordinates(x))
-
-    def restoring(self, y: Array) -> Array:
-        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
-        return self._face.restricted(self._rows @ self._solve(y))
 
 
 # --- Factors of faces -----------------------------------------------------------------------

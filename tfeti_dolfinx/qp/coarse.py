@@ -31,6 +31,10 @@ class Coarse:
     but ``restricted``, ``solve``, ``combined`` and ``particular`` are collective. Without
     equations P = ZZᵀ, and nothing is communicated for it.
 
+    Where rows follow others, λ = (I + C)u with u in the face, the constraint is G(I + C)u = e and
+    P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ with H = G(I + C)ZG_fᵀ in the place of G_fG_fᵀ. That is oblique,
+    and not for ``project_against`` and ``norm_Q``; G(I + C)u = 0 for u = Px.
+
     Attributes:
         comm: Communicator.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
@@ -38,6 +42,7 @@ class Coarse:
         solve: (G_fG_fᵀ)⁺y for a replicated y in the range of G, orthogonal to the free motions.
         dimension: Number r of equations.
         restricted: ZZᵀx, the part of x in the face.
+        followed: (I + C)u.
         face: The face; None: all rows.
         on_face: Of all rows: the constraint on a face of them.
         damped_solve: Of all rows: (G_f G_fᵀ + damping·GGᵀ)⁻¹y of a face f, y and the damping.
@@ -53,10 +58,12 @@ class Coarse:
         e: Array,
         solve: Callable[[Array], Array],
         face: Face | None = None,
+        followed: Callable[[Array], Array] = np.asarray,
     ) -> None:
         self.comm, self.Gt, self.e, self.solve, self.face = comm, Gt, e, solve, face
         self.dimension = int(Gt.shape[1])
         self.restricted: Callable[[Array], Array] = np.asarray if face is None else face.restricted
+        self.followed = followed
 
     @cached_property
     def rows(self) -> LocalMatrix:
@@ -70,20 +77,21 @@ class Coarse:
         return LocalMatrix(entries._replace(data=np.abs(entries.data)))
 
     def G(self, x: Array) -> Array:
-        """G_fZᵀx, replicated."""
+        """G of (I + C)ZZᵀx, replicated."""
         if not self.dimension:
             return NOTHING
-        return summed(self.comm, self.rows.transposed(self.restricted(x)))
+        return summed(self.comm, self.rows.transposed(self.followed(self.restricted(x))))
 
     def residual(self, x: Array) -> Array:
-        """e − G_fZᵀx, replicated."""
+        """e − G(I + C)ZZᵀx, replicated."""
         return np.asarray(self.e - self.G(x))
 
     def terms(self, x: Array) -> Array:
-        """Σ|G_fZᵀ||x|, replicated."""
+        """Σ|G||(I + C)ZZᵀx|, replicated."""
         if not self.dimension:
             return NOTHING
-        return summed(self.comm, self.moduli.transposed(np.abs(self.restricted(x))))
+        own = np.abs(self.followed(self.restricted(x)))
+        return summed(self.comm, self.moduli.transposed(own))
 
     def coordinates(self, x: Array) -> Array:
         """(G_fG_fᵀ)⁺G_fZᵀx, replicated."""

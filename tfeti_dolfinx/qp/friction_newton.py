@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -10,7 +9,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.parallel import dot_over, norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.qp.coarse import HELD
+from tfeti_dolfinx.qp.coarse import HELD, Coarse
 from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.qp.recycling import Recycled, right_singular
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
@@ -57,6 +56,10 @@ class Following:
         y[self.rows] = (self.ratios * x[self.leaders].T).T
         return y
 
+    def followed(self, u: Array) -> Array:
+        """Return (I + C)u, shapes ``(m,)`` or ``(m, q)``."""
+        return np.asarray(u + self @ u)
+
 
 @dataclass(frozen=True)
 class Law:
@@ -96,9 +99,7 @@ class LawProgram:
 
     qp: QP  # F, d and G; its set is not looked at
     law: Law  # the sets
-    # makes the projectors of a face and of C, what follows it: P of λ = (I + C)u with
-    # `coordinates`, `project` and `restoring` as in `ObliqueProjectors`
-    oblique: Callable[[Face, Following], Any]
+    oblique: Callable[[Face, Following], Coarse]  # Gλ = e of λ = (I + C)u, u in a face
     norm: float  # ‖F‖, or an estimate
 
     def natural_map(self, at: LawPoint) -> tuple[FeasibleSet, Array, float]:
@@ -177,10 +178,6 @@ class OnFace:
     C: Following
     p: Array
 
-    def followed(self, u: Array) -> Array:
-        """Return (I + C)u, shapes ``(m,)`` or ``(m, q)``."""
-        return np.asarray(u + self.C @ u)
-
     def entered(self, lam: Array) -> Array:
         """Return λ with open and slipping entries set to those of p, coupled ones following."""
         held = (self.face.status == Status.OPEN) | (self.face.status == Status.SLIP)
@@ -203,7 +200,7 @@ def _solved_on_face(
     M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
 
     def apply(z: Array) -> tuple[Array, Array]:
-        Fz = qp.F(on.followed(z))
+        Fz = qp.F(on.C.followed(z))
         return oblique.project(Fz + on.face.bend(z)), Fz
 
     def precondition(r: Array) -> Array:
@@ -211,8 +208,8 @@ def _solved_on_face(
 
     # Step 3a: λ₁ on the face, and u that restores Gλ = e; s is of λ before
     lam, s = on.entered(at.lam), at.s
-    u = oblique.restoring(qp.coarse.residual(lam))
-    way = lam + on.followed(u) - at.lam
+    u = oblique.combined(oblique.solve(qp.coarse.residual(lam)))
+    way = lam + on.C.followed(u) - at.lam
     basis = known_on(qp.recycled, on, oblique.project)
     size = program.norm * norm_over(comm, way)
     if size > parameters.unseen * target:
@@ -229,7 +226,7 @@ def _solved_on_face(
     u, s = u + z, s + image
     if qp.recycled is not None:
         _, new, images = basis[:, known:]
-        ways = on.followed(new.T)
+        ways = on.C.followed(new.T)
         # where a face holds a motion by nothing but rounding they do not keep Gλ = e
         kept: Array = np.ones(len(new), dtype=bool)
         if qp.coarse.dimension:
@@ -238,7 +235,7 @@ def _solved_on_face(
         for way, image in zip(ways.T[kept], images[kept], strict=True):
             qp.recycled.keep(way, image)
     mu = oblique.coordinates(s + on.face.bend(u))
-    return LawPoint(lam + on.followed(u), s - qp.coarse.combined(mu), at.mu + mu)
+    return LawPoint(lam + on.C.followed(u), s - qp.coarse.combined(mu), at.mu + mu)
 
 
 # --- Generalised conjugate residuals ----------------------------------------------------------
@@ -311,7 +308,7 @@ def known_on(
         return nothing
     W, FW = past.directions.T, past.images.T
     U = on.face.restricted(W - on.C @ W)
-    N = past.without(W - on.followed(U))
+    N = past.without(W - on.C.followed(U))
     if N.shape[1] == 0:
         return nothing
     U, FU = U @ N, FW @ N

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import dot_over, least, summed
 from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, Operator, Steps, no_monitor
-from tfeti_dolfinx.qp.sets import FeasibleSet, Status
+from tfeti_dolfinx.qp.sets import FeasibleSet, Status, face_at
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class MprgpIterate:
     """An iterate x ∈ Ω of min ½xᵀAx − bᵀx, with its gradient g = Ax − b and its parts.
 
     Attributes:
+        face: That of x and g.
         phi: Free gradient φ.
         beta: Chopped gradient β.
         chopped_squared: ‖β‖².
@@ -48,7 +49,8 @@ class MprgpIterate:
 
     def split(self) -> None:
         """Find φ and β at x. Collective."""
-        self.phi, self.beta = self.feasible.split(self.x, self.g)
+        self.face = face_at(self.feasible, self.x, self.g)
+        self.phi, self.beta = np.where(self.face.free, self.g, 0.0), self.face.beta
         squares = dot_over(self.comm, (self.phi, self.phi), (self.beta, self.beta))
         self.chopped_squared, self.projected_gradient = squares[1], sum(squares) ** 0.5
 
@@ -76,7 +78,7 @@ def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
     Multiplies by A once more than there are steps. Return the conjugate gradient steps; 0 where
     little of β is tangential, or the cost does not fall.
     """
-    x, g, comm, face = state.x, state.g, state.comm, state.feasible.face(state.x, state.g)
+    x, g, comm, face = state.x, state.g, state.comm, state.face
     Z, kappa, inside = face.Z, face.bends, face.status != Status.SLIP
     on_face = Z.T @ state.beta
     if dot_over(comm, (on_face, on_face))[0] < parameters.tangential * state.chopped_squared:

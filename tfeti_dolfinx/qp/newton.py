@@ -29,7 +29,7 @@ from tfeti_dolfinx.qp.projection import (
     WithinFace,
     project_onto_feasible,
 )
-from tfeti_dolfinx.qp.sets import Face, Status
+from tfeti_dolfinx.qp.sets import Face, Status, face_at
 
 RUBS = Status.STICK  # least status of rows with friction
 
@@ -261,11 +261,9 @@ class NewtonIteration:
         λ̂, on its face, for one multiplication by F.
         """
         z = self.z
-        phi, beta = self.feasible.split(z.lam, self.s)
-        face = self.feasible.face(z.lam, self.s)
-        along = face.restricted(beta)  # along a boundary that is curved
-        beta = beta - along
-        phi = phi + along
+        face = face_at(self.feasible, z.lam, self.s)
+        along = face.restricted(face.beta)  # along a boundary that is curved
+        phi, beta = np.where(face.free, self.s, along), face.beta - along
         free, chopped = self.qp.dot((phi, phi), (beta, beta))
         if self.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
             free = self.solver.left**2

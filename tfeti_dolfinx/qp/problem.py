@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, dot_over, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
+from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, face_at
 
 # --- The quadratic program and its result -----------------------------------------------------
 # Vectors are this rank's parts, in the layout of all rows, shape ``(m,)``.
@@ -259,15 +259,15 @@ def homogenise(qp: QP, at: OperatorProduct | None = None, warm: bool = False) ->
     # 1. b; d on rows that are open without forces: P would spread it over all others
     gradient = at.Fx - qp.d
     residual = project(gradient)
-    phi, beta = qp.feasible.split(qp.feasible.project(np.zeros(len(qp.d))), -qp.d)
-    gaps = np.where((phi == 0.0) & (beta == 0.0), qp.d, 0.0)
+    face = face_at(qp.feasible, qp.feasible.project(np.zeros(len(qp.d))), -qp.d)
+    gaps = np.where(face.free | (face.beta != 0.0), 0.0, qp.d)
     b = project(-gradient - gaps)
     b = b + gaps if norm(b) <= FAR_OPEN * norm(gaps) else -residual
     # 2. the size of residuals, and its rounding, to which open gaps, however wide, do not count
     size = max(norm(project(qp.d)), norm(project(at.Fx))) if warm else norm(residual)
-    phi, beta = qp.feasible.split(qp.feasible.project(at.x), residual)
+    face = face_at(qp.feasible, qp.feasible.project(at.x), residual)
     # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
-    counts = (phi != 0.0) | ((beta != 0.0) & (qp.d > 0.0))
+    counts = face.free | ((face.beta != 0.0) & (qp.d > 0.0))
     rounding = ROUNDING * sum(norm(np.where(counts, x, 0.0)) for x in (qp.d, at.Fx))
     return Homogenised(at.x, gradient, b, size, rounding)
 

@@ -47,6 +47,8 @@ class Face:
         curvature: What the set's boundary adds to the Hessian along each tangent: where the
             gradient pushes against it, moving along the set by Zt changes gᵀx by
             gᵀZt + ½ Σ κ_j t_j². 0 where it is flat or not pushed against. Shape ``(t,)``.
+        beta: Chopped gradient β, 0 where rows are free; the free one φ is the gradient there, and
+            φ + β the projected gradient. Shape ``(m,)``.
     """
 
     free: Array
@@ -54,6 +56,7 @@ class Face:
     tangent_rows: Array = field(default_factory=np.zeros((0, 2), dtype=np.int64).copy)
     tangents: Array = field(default_factory=np.zeros((0, 2)).copy)
     curvature: Array = field(default_factory=np.zeros(0).copy)
+    beta: Array = field(default_factory=np.zeros(0).copy)
 
     @cached_property
     def carrying(self) -> Array:
@@ -97,7 +100,7 @@ class Face:
     def with_tangents(self, kept: Array) -> Face:
         """Return the face with some of its tangents only, the others held."""
         rows, tangents = self.tangent_rows[kept], self.tangents[kept]
-        return Face(self.free, self.status, rows, tangents, self.curvature[kept])
+        return replace(self, tangent_rows=rows, tangents=tangents, curvature=self.curvature[kept])
 
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
@@ -132,7 +135,7 @@ class Face:
 
 
 class FeasibleSet(Protocol):
-    """A set Ω of vectors of n entries, and the parts of a gradient that belong to it.
+    """A set Ω of vectors of n entries, and its faces.
 
     All arrays have the shape ``(n,)``; none that is passed may be written to.
     ``check_feasible_set`` tests any implementation.
@@ -141,17 +144,27 @@ class FeasibleSet(Protocol):
     def project(self, x: Array) -> Array:
         """P_Ω(x), the nearest point of Ω."""
 
-    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
-        """Free gradient φ and chopped gradient β at x ∈ Ω; φ + β is the projected gradient."""
-
     def max_step(self, x: Array, p: Array) -> float:
         """Return the largest α with x − α p ∈ Ω, maybe infinite."""
 
     def face(self, x: Array, g: Array) -> Face:
-        """Return the face of x ∈ Ω, given the gradient there."""
+        """Return the face of x ∈ Ω, and β of the gradient there."""
 
     def onto(self, x: Array, status: Array) -> Array:
         """P_Ω(x), but on their bounds where rows are open, and on the boundary where they slip."""
+
+
+def face_at(feasible: FeasibleSet, x: Array, g: Array) -> Face:
+    """Return a set's face with its β; where that has none, the β of its ``split(x, g) = φ, β``."""
+    face = feasible.face(x, g)
+    if face.beta.shape == x.shape:
+        return face
+    if (split := getattr(feasible, "split", None)) is None:
+        raise InputError(
+            f"extensions: feasible_set: beta of {type(feasible).__name__} has shape "
+            f"{face.beta.shape}; expected {x.shape}"
+        )
+    return replace(face, beta=split(x, g)[1])
 
 
 @dataclass(frozen=True)
@@ -164,20 +177,16 @@ class Bounds:
         """max(x, l)."""
         return np.maximum(x, self.lower)
 
-    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
-        """φ = g off the bounds; β = min(g, 0) on them."""
-        bound = x <= self.lower
-        return np.where(bound, 0.0, g), np.where(bound, np.minimum(g, 0.0), 0.0)
-
     def max_step(self, x: Array, p: Array) -> float:
         """min over p_i > 0 of (x_i − l_i)/p_i."""
         down = p > 0.0
         return float(np.min((x - self.lower)[down] / p[down], initial=np.inf))
 
     def face(self, x: Array, g: Array) -> Face:
-        """Return the face of x: rows off their bounds are free, they touch."""
+        """Return the face of x: off their bounds rows are free, they touch; else β = min(g, 0)."""
         off = np.asarray(x > self.lower)
-        return Face(off, np.where(off, Status.TOUCHING, Status.OPEN))
+        beta = np.where(off, 0.0, np.minimum(g, 0.0))
+        return Face(off, np.where(off, Status.TOUCHING, Status.OPEN), beta=beta)
 
     def onto(self, x: Array, status: Array) -> Array:
         """max(x, l); l where rows are open."""
@@ -217,13 +226,6 @@ class Product:
             y[rows] = factor.project(x[rows])
         return y
 
-    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
-        """φ and β of each set; φ = g on free rows."""
-        phi, beta = np.array(g), np.zeros(len(g))
-        for rows, factor in self.factors:
-            phi[rows], beta[rows] = factor.split(x[rows], g[rows])
-        return phi, beta
-
     def max_step(self, x: Array, p: Array) -> float:
         """Return the least of all sets."""
         steps = [factor.max_step(x[rows], p[rows]) for rows, factor in self.factors]
@@ -231,21 +233,22 @@ class Product:
 
     def face(self, x: Array, g: Array) -> Face:
         """Free rows, then the directions of each set."""
-        status, found = np.zeros(len(x), dtype=np.int64), []
+        status, beta, found = np.zeros(len(x), dtype=np.int64), np.zeros(len(x)), []
         free = status == Status.FREE
         for rows, factor in self.factors:
-            face = factor.face(x[rows], g[rows])
-            status[rows], free[rows] = face.status, face.free
+            face = face_at(factor, x[rows], g[rows])
+            status[rows], free[rows], beta[rows] = face.status, face.free, face.beta
             if len(face.tangents):
                 found.append((rows[face.tangent_rows], face.tangents, face.curvature))
         if not found:
-            return Face(free, status)
+            return Face(free, status, beta=beta)
         width = max(tangents.shape[1] for _, tangents, _ in found)
         tables = []
         for at, tangents, kappa in found:
-            wider = ((0, 0), (0, width - tangents.shape[1]))
-            tables.append((np.pad(at, wider), np.pad(tangents, wider), kappa))
-        return Face(free, status, *map(np.concatenate, zip(*tables, strict=True)))
+            none = np.zeros((len(at), width - at.shape[1]), dtype=at.dtype)
+            tables.append((np.hstack((at, none)), np.hstack((tangents, none)), kappa))
+        at, tangents, kappa = map(np.concatenate, zip(*tables, strict=True))
+        return Face(free, status, at, tangents, kappa, beta)
 
     def onto(self, x: Array, status: Array) -> Array:
         """Each set's, x itself on free rows."""
@@ -291,16 +294,6 @@ class Ellipses:
             nearest[outside] = self._nearest(t[outside], outside)
         return np.asarray(nearest.ravel())
 
-    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
-        """φ = g inside; on the boundary β = g − min(nᵀg, 0)n, n its outward normal."""
-        t = x.reshape(self.semi_axes.shape)
-        on, normal = self._boundary(t)
-        g = np.where(self._moves, g.reshape(self.semi_axes.shape), 0.0)
-        pushing = np.minimum(np.sum(normal * g, axis=1), 0.0)
-        phi = np.where(on[:, None], 0.0, g)
-        beta = np.where(on[:, None], g - pushing[:, None] * normal, 0.0)
-        return phi.ravel(), beta.ravel()
-
     def max_step(self, x: Array, p: Array) -> float:
         """Largest α with x − αp inside: the smallest root of a quadratic equation for each."""
         p = p.reshape(self.semi_axes.shape)
@@ -317,26 +310,28 @@ class Ellipses:
         return float(np.min(steps, initial=np.inf))
 
     def face(self, x: Array, g: Array) -> Face:
-        """Inside all directions are free: it sticks. On the boundary the tangent: it slips."""
+        """Inside all directions are free: it sticks. On the boundary the tangent: it slips.
+
+        β = g + (−nᵀg)⁺n there, n the outward normal.
+        """
         t = x.reshape(self.semi_axes.shape)
         on, normal = self._boundary(t)
         status = np.where(on[:, None], Status.SLIP, Status.STICK)
         status = np.where(self._moves, status, Status.OPEN)
-        free = (self._moves & ~on[:, None]).ravel()
-        if self.semi_axes.shape[1] != 2:
-            return Face(free, status.ravel())
-        along = np.flatnonzero(on & self._moves.all(axis=1))
-        if not len(along):
-            return Face(free, status.ravel())
-        n = normal[along]
         g = np.where(self._moves, g.reshape(self.semi_axes.shape), 0.0)
-        # κ = (−nᵀg)⁺ τᵀHτ/‖Ht‖ with H = diag(a)⁻² and τ the tangent
         pushing = np.maximum(-np.sum(g * normal, axis=1), 0.0)
-        slope = np.linalg.norm(self._inverse**2 * t, axis=1)
-        bent = np.sum(self._inverse**2 * normal[:, ::-1] ** 2, axis=1)
-        kappa = pushing * quotient(bent, slope)
+        beta = np.where(on[:, None], g + pushing[:, None] * normal, 0.0)
+        face = Face((self._moves & ~on[:, None]).ravel(), status.ravel(), beta=beta.ravel())
+        along = np.flatnonzero(on & self._moves.all(axis=1))
+        if self.semi_axes.shape[1] != 2 or not len(along):
+            return face
+        # κ = (−nᵀg)⁺ τᵀHτ/‖Ht‖ with H = diag(a)⁻² and τ the tangent
+        n, H = normal[along], self._inverse[along] ** 2
+        slope = np.linalg.norm(H * t[along], axis=1)
+        bent = np.sum(H * n[:, ::-1] ** 2, axis=1)
+        kappa = pushing[along] * quotient(bent, slope)
         rows, tangents = 2 * along[:, None] + (0, 1), np.stack((-n[:, 1], n[:, 0]), axis=1)
-        return Face(free, status.ravel(), rows, tangents, kappa[along])
+        return replace(face, tangent_rows=rows, tangents=tangents, curvature=kappa)
 
     def onto(self, x: Array, status: Array) -> Array:
         """The nearest points of the ellipses; of their boundary, from inside too, for slip."""

@@ -96,8 +96,7 @@ class InnerTest:
     def examine(self, state: MprgpIterate, equality: float) -> float:
         """Apply the stopping rule, given ‖Q(λ − λ̄)‖; return the residual. Collective."""
         residual = max(state.projected_gradient, self._qp.norm * equality)
-        face = state.feasible.face(state.x, state.g)
-        self.reason = self._rule.examine(state.x, state.g, face, residual)
+        self.reason = self._rule.examine(state.x, state.g, state.face, residual)
         return residual
 
     def update(self, lagrangian: float, equality: float) -> None:
@@ -201,7 +200,7 @@ def smalse(
         lam=qp.feasible.project(state.x),  # rounding may leave it off its bounds
         mu=coarse.coordinates(y),
         gradient=state.g,
-        face=qp.feasible.face(state.x, state.g),
+        face=state.face,
         reason=reason,
         projected_gradient=state.projected_gradient,
         equality=equality,
