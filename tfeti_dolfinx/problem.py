@@ -314,7 +314,7 @@ class ContactProblem:
         end = gluing, lam, result.mu, system.inverses
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
-        counts = SolverCounts.of_run(dual, *solved)
+        counts = SolverCounts.of_run(dual, result, settling)
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
         contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
         excluding = system.search.named(contacts)

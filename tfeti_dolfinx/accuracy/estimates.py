@@ -106,7 +106,7 @@ def of_looks(accuracy: Accuracy) -> dict[str, float]:
         return {}
     last = reached[-1]
     return {
-        "energy": last.energy,
+        "energy": accuracy.measures.energy,
         "algebraic": last.bound,
         "discretisation": last.goal,
         "rounding": accuracy.allowed.rounding,

@@ -97,7 +97,7 @@ class InnerTest:
         """Apply the stopping rule, given ‖Q(λ − λ̄)‖; return the residual. Collective."""
         residual = max(state.projected_gradient, self._qp.norm * equality)
         face = state.feasible.face(state.x, state.g)
-        self.reason = self._rule.examine(state.x, state.g, face, residual)
+        self.reason = self._rule.examine(state.x, state.g, face, residual, self._qp.norm)
         return residual
 
     def update(self, lagrangian: float, equality: float) -> None:

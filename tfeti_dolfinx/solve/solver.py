@@ -122,8 +122,7 @@ def solve_dual(
         monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
     rtol = options.number if rtol is None else rtol
     scale = homogenised.reference, homogenised.rounding
-    rule = make_rule(dual, rtol, options.atol, scale, qp.norm)
-    rule.goal, rule.waits = goal, goal is not None  # assessments against a target are costly
+    rule = make_rule(dual, rtol, options.atol, scale, goal)
     own, most = getattr(options, qp_type, solver.parameters), options.max_it
     result = solver.solve(
         qp, homogenised, rule, own, max_it=most, start=begin, monitor=monitor or no_monitor
