@@ -222,7 +222,6 @@ class Outcome:
         accuracy: Accuracy,
         settling: FixedPointStatus,
         excluding: list[str],
-        estimates: dict[str, float],
         nearly_free: list[dict[str, Any]],
     ) -> Self:
         """Measure an answer, warnings apart. Collective."""
@@ -247,7 +246,7 @@ class Outcome:
             peak_memory_mb=kilobytes / 1024.0,
             residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
             tolerances=_tolerances(solution, accuracy) | {"friction": settling.tolerance},
-            estimates=estimates,
+            estimates=accuracy.estimates,
             tools=[str(solution.tool(i)) for i in range(len(solution.tool_motions))],
         )
 

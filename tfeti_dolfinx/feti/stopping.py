@@ -178,15 +178,6 @@ def measure(
 # --- The stopping rule ------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TargetStatus:
-    """Algebraic error of an iterate, and what it is compared with; the same on all ranks."""
-
-    bound: float  # bound of its algebraic error
-    moved: float  # distance in energy to the displacement of forces that balance the load
-    goal: float  # the other error
-
-
 class Criterion(NamedTuple):
     """An error and what it may be: numbers that are the same on all ranks, or one for each body."""
 
@@ -240,13 +231,15 @@ class Accuracy(StoppingRule):
         looks: How many looks there were.
         measures: What the last look has seen, and ``allowed`` the tolerances of that.
         checks: All that the last look has compared, by name.
-        reached: What looks have seen of the algebraic error beside the goal.
+        estimates: With a goal the errors at the last look, and what they have cost at all looks, as
+            in ``Estimates`` of ``accuracy/estimates.py``.
     """
 
     limits = StoppingTolerances()
     measures: Measures
     allowed: Tolerances
     checks: dict[str, Criterion]
+    recovered: Recovered
     u: Array
 
     def __init__(
@@ -265,9 +258,8 @@ class Accuracy(StoppingRule):
         drives = reference > self._rounding
         self._small = 0.01 * max(rtol * reference, self._rounding) if drives else self._rounding
         self.looks, self._stopped, self._norm = 0, False, 1.0
-        self.recovered: Recovered | None = None
         self._before: Measures | None = None
-        self.reached: list[TargetStatus] = []
+        self.estimates: dict[str, float] = {}
 
     def criteria(self) -> dict[str, Criterion]:
         """Return what has to be right, by name, from ``measures``, ``allowed`` and ``rtol``.
@@ -294,7 +286,6 @@ class Accuracy(StoppingRule):
         self._norm = norm or 1.0
         self._look(lam, gradient, face, residual)
         reason = self._verdict(residual)
-        assert self.recovered is not None
         if self.recovered.loose.count and (reason > 0 or self._stopped):
             self._place(face)
             reason = self._verdict(residual)
@@ -336,8 +327,6 @@ class Accuracy(StoppingRule):
 
     def _place(self, face: Face) -> None:
         """Place bodies that nothing holds, and measure the last look again. Collective."""
-        assert self.recovered is not None
-        del self.reached[-1:]
         unseen = min(self.limits.share_unseen * self.rtol, self.limits.unseen)
         state = placed(self._dual.coarse, self.recovered, self._dual.begin, unseen)
         now = measure(self._dual, state, face, self._norm)
@@ -350,12 +339,18 @@ class Accuracy(StoppingRule):
         self.allowed = self._tolerances()
         self.checks = self.criteria() | {"balance": Criterion(now.balance, self.allowed.balance)}
         if self._goal is not None:
-            error = energy_bound(self._dual, state.lam, state.u, self._norm)
-            goal = self._goal(state.u)
-            self.reached.append(TargetStatus(*error, goal))
-            allowed = self.limits.target * max(goal, 1e-5 * now.energy)
-            allowed = max(allowed, self.allowed.rounding)
-            self.checks["algebraic_error"] = Criterion(error[0], allowed, size=now.energy)
+            bound, moved = energy_bound(self._dual, state.lam, state.u, self._norm)
+            goal, rounding, known = self._goal(state.u), self.allowed.rounding, self.estimates
+            allowed = max(self.limits.target * max(goal, 1e-5 * now.energy), rounding)
+            self.checks["algebraic_error"] = Criterion(bound, allowed, size=now.energy)
+            self.estimates = {
+                "energy": now.energy,
+                "algebraic": bound,
+                "discretisation": goal,
+                "rounding": rounding,
+                "lifting_multiplications": known.get("lifting_multiplications", 0) + 1,
+                "recoveries": known.get("recoveries", 0) + (moved > 0.0),
+            }
 
     def look_again(self, face: Face) -> bool:
         """Measure the iterate of the last look with another set of multipliers. Collective.
@@ -364,7 +359,6 @@ class Accuracy(StoppingRule):
         has seen stays the least of the errors. Return whether it is right to the tolerance with
         that set, too.
         """
-        assert self.recovered is not None
         first, self._before = self.checks, None
         self._assess(self.recovered, measure(self._dual, self.recovered, face, self._norm))
         for name, now in self.checks.items():

@@ -166,7 +166,7 @@ def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, 
     """
     state, coarse = rule.recovered, dual.coarse
     known = motion is not None or result.reason == ConvergedReason.DIVERGED_CONTRADICTION
-    if not known and state is not None and dual.contact_rows[1] and coarse.dimension:
+    if not known and dual.contact_rows[1] and coarse.dimension:
         slip, bends = (np.abs(x) / coarse.row_size for x in (state.gap, state.residual))
         rubs = coarse.rubbing[state.active[coarse.rubbing]]  # what is let go may go anywhere
         if largest(coarse.comm, slip[rubs]) > most * largest(coarse.comm, bends):

@@ -136,8 +136,8 @@ def solve_dual(
         dual.rough = None  # what single precision does not tell: begin again with F itself
         return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
-    if (state := rule.recovered) is not None:
-        dual.last.looked = state.lam, state.residual
+    if rule.looks:
+        dual.last.looked = rule.recovered.lam, rule.recovered.residual
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
     if result.reason <= 0 and (options.max_it > 0 or rule.looks == 0):  # else a look was all
