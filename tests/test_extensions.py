@@ -12,7 +12,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.projectors import FaceFactors, NullModes
-from tfeti_dolfinx.feti.stopping import Accuracy
+from tfeti_dolfinx.feti.stopping import Accuracy, Criterion
 from tfeti_dolfinx.subdomains.block import Block, kernel_of
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -105,16 +105,58 @@ def test_a_monitor_of_one_s_own():
     assert inner[-1] < 1e-3 * max(inner)
 
 
-def test_a_stopping_rule_of_one_s_own():
-    class InEnergy(Accuracy):
-        def ratio(self):
-            return self.measures.error / (1e-2 * self.measures.energy)
+class InEnergy(Accuracy):
+    """Stops where the error of u in energy is at most rtol ‖u‖_K."""
 
-    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))]
-    _, p = solved(obstacles)
-    _, q = solved(obstacles, Extensions(stopping=InEnergy))
-    assert q.report.F_multiplications < p.report.F_multiplications
-    assert p.report.residuals["energy_error"] < q.report.residuals["energy_error"] <= 1e-2
+    def criteria(self):
+        now, rounding = self.measures, self.allowed.rounding
+        return {"energy_error": Criterion(now.error, self.rtol * now.energy, rounding, now.energy)}
+
+
+@pytest.mark.parametrize("law", [None, tfeti.Coulomb(0.5)])
+def test_a_stopping_rule_of_one_s_own(law):
+    """It stops where it says, with Coulomb's law where all looks at the answer say so."""
+    looks, d = [], decomposed("hexahedron", 6, 4)
+    floor = [tfeti.Obstacle("bottom", curved_obstacle(3), friction=law)]
+
+    class Seen(InEnergy):
+        def criteria(self):
+            looks.append(super().criteria()["energy_error"])
+            return {"energy_error": looks[-1]}
+
+    def answer(stopping, rtol):
+        p = problem(d, contacts=floor, extensions=Extensions(stopping=stopping), rtol=rtol)
+        p.solve()
+        return p, p.report.residuals, p.report.tolerances
+
+    exact = answer(InEnergy, 1e-9)[0]
+    p, error, allowed = answer(Seen, 1e-3)
+    u, parts = exact.solution.u, p.dual.subdomains
+    off, size = (d.comm.allreduce(sum(parts.energies(v))) ** 0.5 for v in (p.solution.u - u, u))
+    assert p.report.F_multiplications < exact.report.F_multiplications
+    assert off <= 2.0 * error["energy_error"] * size <= 2.0 * allowed["energy_error"] * size
+    assert allowed["energy_error"] == pytest.approx(1e-3)
+    assert "displacement_error" not in allowed
+    assert f"energy error {error['energy_error']:.1e} (allowed 1.0e-03)" in str(p.report)
+    last = looks[-1:] if law is None else looks[-2:]
+    assert error["energy_error"] == max(look.relative()[0] for look in last)
+
+
+def test_a_rule_that_asks_nothing_leaves_the_balance_and_the_target():
+    class Nothing(Accuracy):
+        def criteria(self):
+            return {}
+
+    costs, floor = [], [tfeti.Obstacle("bottom", curved_obstacle(3))]
+    for rtol, checks in ((1e-2, {"balance"}), ("auto", {"balance", "algebraic_error"})):
+        own = Extensions(stopping=Nothing)
+        p = problem(decomposed("hexahedron", 6, 4), contacts=floor, extensions=own, rtol=rtol)
+        p.solve()
+        error, allowed = p.report.residuals, p.report.tolerances
+        assert set(allowed) == {*checks, "tension", "friction"}
+        assert all(error[name] <= allowed[name] for name in checks)
+        costs.append(p.report.F_multiplications)
+    assert costs[0] < costs[1]
     with pytest.raises(tfeti.InputError, match="stopping gave .* without .*; expected a rule"):
         solved(extensions=Extensions(stopping=lambda *given: None))
 

@@ -224,7 +224,7 @@ class Accuracy(StoppingRule):
     A rule of one's own overrides ``criteria``.
 
     Attributes:
-        limits: Tolerances beside rtol, of all rules of a class.
+        limits: Tolerances beside rtol; those of a class.
         tolerance: Norm of the residuals from which on one looks (again).
         recovered: What the last look has recovered.
         u: This rank's part of its displacement, shape ``(n,)``.
@@ -371,10 +371,8 @@ class Accuracy(StoppingRule):
         """Assess where a solver has stopped early: errors that rounding explains are accepted."""
         self._small, self._stopped = float("inf"), True
         residual = max(result.projected_gradient, result.norm * result.equality)
-        lam, gradient, face = result.lam, result.gradient, result.face
-        reason = self.examine(lam, gradient, face, residual, result.norm)
-        if reason > 0:
-            result.reason = reason
+        reason = self.examine(result.lam, result.gradient, result.face, residual, result.norm)
+        result.reason = reason if reason > 0 else result.reason
 
     def errors(self) -> Array:
         """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``."""
