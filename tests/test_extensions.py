@@ -108,7 +108,7 @@ def test_a_stopping_rule_of_one_s_own(law):
     energies, report = p.dual.subdomains.energies, p.report
     off, size = (d.comm.allreduce(sum(energies(v))) ** 0.5 for v in (u - known, known))
     error, allowed = report.residuals["energy_error"], report.tolerances["energy_error"]
-    assert off <= 2.0 * error * size <= 2.0 * allowed * size
+    assert off <= min(1.25 * error, allowed) * size
     assert f"energy error {error:.1e} (allowed 1.0e-03)" in str(report)
     assert "displacement_error" not in report.tolerances
     assert report.F_multiplications < exact.report.F_multiplications
@@ -137,7 +137,7 @@ def test_a_stopping_rule_need_not_know_of_the_target_nor_of_coulomb():
         # of the two looks at an answer with Coulomb's law the larger error
         assert error["own"] == 1.0 / (Falling.seen - (law is not None))
         costs.append(p.report.F_multiplications)
-    assert costs[0] < costs[1]  # what the target takes
+    assert costs[0] < costs[1]
     with pytest.raises(tfeti.InputError, match="stopping gave .* without .*; expected a rule"):
         solved(extensions=Extensions(stopping=lambda *given: None))
 
