@@ -279,15 +279,21 @@ class Accuracy(StoppingRule):
     def examine(
         self, lam: Array, gradient: Array, face: Face, residual: float, norm: float
     ) -> ConvergedReason:
-        """Assess an iterate, and return why to stop, or ITERATING. Collective.
-
-        Only in an answer bodies are placed: a rough iterate has forces too small to hold them.
-        """
-        self._norm = norm or 1.0
-        self._look(lam, gradient, face, residual)
+        """Assess an iterate, and return why to stop, or ITERATING. Collective."""
+        dual, self._norm = self._dual, norm or 1.0
+        # 1. its displacement, beside that of the look before
+        state = recover(dual.constraints, dual.coarse, lam, gradient, face, residual / self._norm)
+        self._before, u = (self.measures, self.u) if self.looks else (None, None)
+        self.looks, self.waits = self.looks + 1, False
+        self._assess(state, measure(dual, state, face, self._norm, u))
         reason = self._verdict(residual)
-        if self.recovered.loose.count and (reason > 0 or self._stopped):
-            self._place(face)
+        # 2. in an answer bodies that nothing holds are placed: a rough iterate has forces too small
+        # to hold them
+        if state.loose.count and (reason > 0 or self._stopped):
+            unseen = min(self.limits.share_unseen * self.rtol, self.limits.unseen)
+            state = placed(dual.coarse, state, dual.begin, unseen)
+            now = measure(dual, state, face, self._norm)
+            self._assess(state, replace(now, change=self.measures.change))
             reason = self._verdict(residual)
         return reason
 
@@ -316,21 +322,6 @@ class Accuracy(StoppingRule):
             return ConvergedReason.DIVERGED_ROUNDING
         self.tolerance = float(tolerance)
         return ConvergedReason.ITERATING
-
-    def _look(self, lam: Array, gradient: Array, face: Face, residual: float) -> None:
-        """Recover the displacement of an iterate, and measure it. Collective."""
-        dual = self._dual
-        state = recover(dual.constraints, dual.coarse, lam, gradient, face, residual / self._norm)
-        self._before, u = (self.measures, self.u) if self.looks else (None, None)
-        self.looks, self.waits = self.looks + 1, False
-        self._assess(state, measure(dual, state, face, self._norm, u))
-
-    def _place(self, face: Face) -> None:
-        """Place bodies that nothing holds, and measure the last look again. Collective."""
-        unseen = min(self.limits.share_unseen * self.rtol, self.limits.unseen)
-        state = placed(self._dual.coarse, self.recovered, self._dual.begin, unseen)
-        now = measure(self._dual, state, face, self._norm)
-        self._assess(state, replace(now, change=self.measures.change))
 
     def _assess(self, state: Recovered, now: Measures) -> None:
         """Compare the errors of a displacement with their tolerances. Collective with a goal."""
