@@ -78,12 +78,6 @@ def test_variants_find_the_same(options):
     assert relative(displacement(p)[1], reference()[0]) <= 1e-8
 
 
-def test_the_laws_of_contact_hold_below_the_tolerance():
-    p = solved(contact_problem(tfeti_rtol=1e-6))
-    for name, allowed in p.report.tolerances.items():
-        assert p.report.residuals[name] <= allowed, name
-
-
 def test_forces_are_in_equilibrium_with_the_stress():
     """The contact force is what the load and the clamped face leave over."""
     p = contact_problem(tfeti_rtol=1e-10)

@@ -12,7 +12,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.projectors import FaceFactors, NullModes
-from tfeti_dolfinx.feti.stopping import Accuracy
+from tfeti_dolfinx.feti.stopping import Accuracy, Criterion
 from tfeti_dolfinx.subdomains.block import Block, kernel_of
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -29,22 +29,16 @@ class DensePinv:
         return self.inverse @ b
 
 
-class Doubled:
+class Doubled(GroupedOperator):
     """Twice the stiffness of the trace: scales a preconditioner, which changes nothing."""
 
-    def __init__(self, blocks):
-        self.half = GroupedOperator(blocks, "stiffness")
-
-    def prepare(self):
-        self.half.prepare()
-
     def mult(self, w, out):
-        self.half.mult(w, out)
+        super().mult(w, out)
         out *= 2.0
 
 
 def doubled(B, subdomains):
-    return DualOperator(B, Doubled(subdomains.blocks))
+    return DualOperator(B, Doubled(subdomains.blocks, "stiffness"))
 
 
 def solved(contacts=(), extensions=None, **options):
@@ -53,13 +47,6 @@ def solved(contacts=(), extensions=None, **options):
     u = p.solve().x.array.copy()
     p.destroy()
     return u, p
-
-
-def test_an_inverse_of_one_s_own():
-    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))]
-    known, _ = solved(obstacles)
-    own, _ = solved(obstacles, Extensions(kplus=DensePinv))
-    assert apart(own, known) <= 1e-7
 
 
 def test_a_preconditioner_of_one_s_own():
@@ -85,8 +72,7 @@ def test_subdomains_and_deflation_of_one_s_own():
         return SimpleNamespace(count=0, factors=factors, **own)
 
     own = Extensions(subdomains=subdomains, deflation=deflation)
-    known, _ = solved()
-    found, _ = solved(extensions=own)
+    known, found = (solved(extensions=parts)[0] for parts in (None, own))
     assert asked == ["subdomains", "deflation"]
     assert np.array_equal(found, known)
     with pytest.raises(tfeti.InputError, match="are given, and clusters, .*; expected one of them"):
@@ -105,18 +91,57 @@ def test_a_monitor_of_one_s_own():
     assert inner[-1] < 1e-3 * max(inner)
 
 
-def test_a_stopping_rule_of_one_s_own():
-    class InEnergy(Accuracy):
-        def ratio(self):
-            return self.measures.error / (1e-2 * self.measures.energy)
+class InEnergy(Accuracy):
+    """Stops where the error of u in energy is at most rtol ‖u‖_K."""
 
-    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))]
-    _, p = solved(obstacles)
-    _, q = solved(obstacles, Extensions(stopping=InEnergy))
-    assert q.report.F_multiplications < p.report.F_multiplications
-    assert p.report.residuals["energy_error"] < q.report.residuals["energy_error"] <= 1e-2
+    def criteria(self):
+        now, rounding = self.measures, self.allowed.rounding
+        return {"energy_error": Criterion(now.error, self.rtol * now.energy, rounding, now.energy)}
+
+
+@pytest.mark.parametrize("law", [None, tfeti.Coulomb(0.5)])
+def test_a_stopping_rule_of_one_s_own(law):
+    d, own = decomposed("hexahedron", 6, 4), Extensions(stopping=InEnergy)
+    floor = [tfeti.Obstacle("bottom", curved_obstacle(3), friction=law)]
+    exact, p = (problem(d, contacts=floor, extensions=own, rtol=rtol) for rtol in (1e-9, 1e-3))
+    known, u = exact.solve() and exact.solution.u, p.solve() and p.solution.u
+    energies, report = p.dual.subdomains.energies, p.report
+    off, size = (d.comm.allreduce(sum(energies(v))) ** 0.5 for v in (u - known, known))
+    error, allowed = report.residuals["energy_error"], report.tolerances["energy_error"]
+    assert off <= min(1.25 * error, allowed) * size
+    assert f"energy error {error:.1e} (allowed 1.0e-03)" in str(report)
+    assert "displacement_error" not in report.tolerances
+    assert report.F_multiplications < exact.report.F_multiplications
+
+
+class Falling(Accuracy):
+    """A rule whose error falls with each look, whatever is found there."""
+
+    seen = 0
+
+    def criteria(self):
+        Falling.seen += 1
+        return {"own": Criterion(1.0 / Falling.seen, 1.0)}
+
+
+def test_a_stopping_rule_need_not_know_of_the_target_nor_of_coulomb():
+    d, own, costs = decomposed("hexahedron", 6, 4), Extensions(stopping=Falling), []
+    for rtol, law in ((1e-2, None), ("auto", None), (1e-2, tfeti.Coulomb(0.5))):
+        floor = [tfeti.Obstacle("bottom", curved_obstacle(3), friction=law)]
+        p, Falling.seen = problem(d, contacts=floor, extensions=own, rtol=rtol), 0
+        p.solve()
+        error, allowed = p.report.residuals, p.report.tolerances
+        assert {"own", "balance"} < set(allowed)
+        assert ("algebraic_error" in allowed) == (rtol == "auto")
+        assert all(error[name] <= allowed[name] for name in allowed)
+        # of the two looks at an answer with Coulomb's law the larger error
+        assert error["own"] == 1.0 / (Falling.seen - (law is not None))
+        costs.append(p.report.F_multiplications)
+    assert costs[0] < costs[1]
     with pytest.raises(tfeti.InputError, match="stopping gave .* without .*; expected a rule"):
         solved(extensions=Extensions(stopping=lambda *given: None))
+    with pytest.raises(tfeti.InputError, match="Old overrides ratio; expected criteria"):
+        type("Old", (Accuracy,), {"ratio": lambda self: 0.0})
 
 
 class DenseBlock(Block):
@@ -145,11 +170,12 @@ def test_it_keeps_the_promises_of_a_block():
 
 
 @pytest.mark.parametrize("pc_type", ["auto", "lumped"])
-def test_it_solves_a_scene(pc_type):
-    contacts = [tfeti.Obstacle("bottom", curved_obstacle(3))] if pc_type == "auto" else []
+@pytest.mark.parametrize("part", [{"block": DenseBlock}, {"kplus": DensePinv}])
+def test_parts_of_a_subdomain_of_one_s_own(part, pc_type):
+    floor = [tfeti.Obstacle("bottom", curved_obstacle(3))] if pc_type == "auto" else []
     known, own = (
-        solved(contacts, extensions, tfeti_pc_type=pc_type)[0]
-        for extensions in (None, Extensions(block=DenseBlock))
+        solved(floor, extensions, tfeti_pc_type=pc_type)[0]
+        for extensions in (None, Extensions(**part))
     )
     assert apart(own, known) <= 1e-7
 

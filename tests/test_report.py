@@ -21,14 +21,12 @@ def report():
 
 
 def test_sizes(report):
-    assert report.subdomains == 8
-    assert report.bodies == 1
-    assert report.kernel_dim == 48
-    assert report.contact_rows == 42
-    assert report.dropped_contact_rows == 7
+    assert (report.subdomains, report.bodies, report.kernel_dim) == (8, 1, 48)
+    assert (report.contact_rows, report.dropped_contact_rows) == (42, 7)
     assert report.primal_dofs == 3 * 8 * 4**3
     assert 0 < report.active_contacts < 42
     assert report.peak_memory_mb > 10
+    assert all(report.residuals[name] <= most for name, most in report.tolerances.items())
 
 
 def test_every_stage_has_its_seconds(report):
@@ -118,7 +116,7 @@ def test_contacts_none_of_which_touches_are_said(height):
             problem(d, contacts=floor, max_it=1).solve()
     else:
         assert p.report.contacts[0].touching > 0
-        assert said == []
+        assert said == solved(problem(d)).report.notes == []
 
 
 def test_friction_of_a_given_bound_acts_on_contacts_none_of_which_touches():
@@ -131,11 +129,6 @@ def test_friction_of_a_given_bound_acts_on_contacts_none_of_which_touches():
     assert p.report.notes == [
         f"no contact touches (smallest gap {contact.gap:.2g}): forces act across open gaps"
     ]
-
-
-def test_no_contact_is_no_contact_that_does_not_touch():
-    p = solved(problem(decomposed("quadrilateral", 3)))
-    assert p.report.notes == []
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])

@@ -57,7 +57,8 @@ class Extensions:
         deflation: Makes a coarse space of the preconditioner on active sets.
         feasible_set: From B and c to the set of multipliers, asked before each run of the solver;
             ``check_feasible_set`` tests it.
-        stopping: Makes the stopping rule of a solve, say a class derived from ``Accuracy``.
+        stopping: Makes the stopping rule of a solve, say a class derived from ``Accuracy`` that
+            overrides ``criteria``.
         monitor: Called after each step of the solver.
 
     Raises:

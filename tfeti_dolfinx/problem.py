@@ -12,7 +12,7 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, notes_of, with_estimates
-from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of, of_looks
+from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of
 from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
@@ -299,7 +299,7 @@ class ContactProblem:
         result, accuracy, settling = solved
         state, lam = accuracy.recovered, result.lam.copy()
         self._let_go = np.zeros(0, dtype=bool)
-        if state is not None and state.loose.count > dual.coarse.free_motions.count:
+        if state.loose.count > dual.coarse.free_motions.count:
             self._let_go = state.loose.moving
             if result.reason > 0:  # forces of contact there are the solver's error
                 lam[let_go(dual.coarse, state)] = 0.0
@@ -314,15 +314,13 @@ class ContactProblem:
         end = gluing, lam, result.mu, system.inverses
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
-        counts = SolverCounts.of_run(dual, *solved)
+        counts = SolverCounts.of_run(dual, result, settling)
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
         contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
         excluding = system.search.named(contacts)
-        loose = list[dict[str, Any]]()
-        if options.warnings and state is not None:
-            loose = dual.nearly_free(state.loose)
-        looks, self._rounding = of_looks(accuracy), accuracy.allowed.rounding
-        outcome = Outcome.of_answer(solution, dual, *solved, excluding, looks, loose)
+        loose = dual.nearly_free(state.loose) if options.warnings else []
+        self._rounding = accuracy.allowed.rounding
+        outcome = Outcome.of_answer(solution, dual, *solved, excluding, loose)
         warnings = list[str]()
         if options.warnings:
             energy, rtol = accuracy.measures.energies, options.number

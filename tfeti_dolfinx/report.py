@@ -106,16 +106,14 @@ class SolverCounts:
     newton_steps: int = 0  # of a nonlinear problem, each a linearised problem
 
     @classmethod
-    def of_run(
-        cls, dual: Dual, result: QPResult, accuracy: Accuracy, settling: FixedPointStatus
-    ) -> Self:
+    def of_run(cls, dual: Dual, result: QPResult, settling: FixedPointStatus) -> Self:
         """Return the counts of a solver's run."""
         preconditioner, inner, steps = dual.preconditioner, dual.deflation, result.steps
         return cls(
             F_multiplications=dual.F.count,
             preconditioner_multiplications=(0 if preconditioner is None else preconditioner.count),
             power_method_multiplications=dual.norm_count,
-            recoveries=accuracy.looks,
+            recoveries=settling.looks,
             friction_iterations=settling.iterations,
             friction_newton_steps=settling.newton_steps,
             outer_iterations=steps.outer,
@@ -224,7 +222,6 @@ class Outcome:
         accuracy: Accuracy,
         settling: FixedPointStatus,
         excluding: list[str],
-        estimates: dict[str, float],
         nearly_free: list[dict[str, Any]],
     ) -> Self:
         """Measure an answer, warnings apart. Collective."""
@@ -249,7 +246,7 @@ class Outcome:
             peak_memory_mb=kilobytes / 1024.0,
             residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
             tolerances=_tolerances(solution, accuracy) | {"friction": settling.tolerance},
-            estimates=estimates,
+            estimates=accuracy.estimates,
             tools=[str(solution.tool(i)) for i in range(len(solution.tool_motions))],
         )
 
@@ -259,7 +256,7 @@ class Outcome:
 PRINTED = 10  # of a list, and lines but for those of contacts; all of it is in the file
 WIDTH = 100  # of the printed lines, but for those of contacts: each has one
 STAGES = 4  # whose seconds are printed, the longest
-SHOWN = ("displacement_error", "penetration", "balance")  # residuals of the short report
+SHOWN = ("penetration", "balance")  # residuals of the short report, after the rule's first
 # what adds up over solves, in ``in_all``
 COUNTERS = [f.name for kind in (SolverCounts, StageCounts) for f in fields(kind) if f.default == 0]
 
@@ -335,7 +332,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         accuracy = [
             f"{name.replace('_', ' ')} {self.residuals[name]:.1e}"
             + f" (allowed {self.tolerances.get(name, 0.0):.1e})" * bool(self.tolerances.get(name))
-            for name in SHOWN
+            for name in dict.fromkeys([*list(self.tolerances)[:1], *SHOWN])
             if name in self.residuals
         ]
         rest, warned = len(self.contacts) - PRINTED, len(self.warnings)
@@ -437,6 +434,7 @@ def _residuals(
 ) -> dict[str, float]:
     comm, gap, rows = solution.dofs.comm, solution.remaining_gap, solution.gluing.contact
     reference = result.reference or 1.0
+    checks = Accuracy.criteria(accuracy) | accuracy.checks  # of errors that are not checked, too
     # of a set of one's own, as of glue that lets go, a force may pull, across a gap too
     missing = dual.feasible.project(solution.lam) - solution.lam
     missing = rows.scale * missing[solution.gluing.constraints.sets.normals]
@@ -451,24 +449,17 @@ def _residuals(
     return {
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
-        "displacement_error": accuracy.relative_error(),
-        "energy_error": accuracy.energy_error()[0],
+        **{name: check.relative()[0] for name, check in checks.items()},
         "gluing_jump": largest(comm, jumps),
         "penetration": largest(comm, np.minimum(gap, 0.0)),
         "tension": largest(comm, np.maximum(tension, 0.0)),
         "complementarity": largest(comm, (solution.force * gap)[closed]),
-        "balance": accuracy.measures.balance,
     }
 
 
 def _tolerances(solution: Solution, accuracy: Accuracy) -> dict[str, float]:
-    comm, allowed = solution.dofs.comm, accuracy.allowed
-    return {
-        "displacement_error": accuracy.rtol,
-        "energy_error": accuracy.energy_error()[1],
-        "gluing_jump": allowed.jump,
-        "penetration": allowed.jump,
-        "tension": 0.0,
-        "complementarity": largest(comm, np.maximum(solution.force, 0.0)) * allowed.jump,
-        "balance": allowed.balance,
-    }
+    allowed = {name: check.relative()[1] for name, check in accuracy.checks.items()}
+    if (jump := allowed.get("penetration")) is not None:
+        force = largest(solution.dofs.comm, np.maximum(solution.force, 0.0))
+        allowed |= {"gluing_jump": jump, "complementarity": force * jump}
+    return allowed | {"tension": 0.0}

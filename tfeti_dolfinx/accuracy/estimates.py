@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import count_over, steering, summed
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.duality_gap import energy_bound
-from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
+from tfeti_dolfinx.feti.stopping import ErrorTarget
 from tfeti_dolfinx.forms.fields import Stress, StressRecovery, checked_stress
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.solution import Solution
@@ -97,19 +97,3 @@ def goal_of(stress: Stress, dofs: TornDofs, thickness: Any) -> ErrorTarget:
         return float(steering(dofs.comm, *np.sqrt(total))[0])
 
     return error
-
-
-def of_looks(accuracy: Accuracy) -> dict[str, float]:
-    """Return the errors at the last assessment of a target, and the cost of all of them."""
-    reached = accuracy.reached
-    if not reached:
-        return {}
-    last = reached[-1]
-    return {
-        "energy": last.energy,
-        "algebraic": last.bound,
-        "discretisation": last.goal,
-        "rounding": accuracy.allowed.rounding,
-        "lifting_multiplications": len(reached),
-        "recoveries": sum(look.moved > 0.0 for look in reached),
-    }

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import energy_bound, within
 from tfeti_dolfinx.feti.recovery import (
@@ -177,15 +179,24 @@ def measure(
 # --- The stopping rule ------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TargetStatus:
-    """Algebraic error of an iterate beside its target; the same on all ranks."""
+class Criterion(NamedTuple):
+    """An error and what it may be: numbers that are the same on all ranks, or one for each body."""
 
-    bound: float  # bound of its algebraic error
-    moved: float  # distance in energy to the displacement of forces that balance the load
-    goal: float  # the other error
-    energy: float  # ‖u‖_K
-    allowed: float  # largest bound of the algebraic error that meets the target
+    error: Array | float
+    allowed: Array | float
+    rounding: float = 0.0  # allowed on top where residuals are small, or forces move nothing
+    size: Array | float = 1.0  # that both are relative to in reports
+
+    def ratio(self, rounds: bool = True) -> float:
+        """Return the error over what it may be, with rounding or without."""
+        most = self.allowed + self.rounding if rounds else self.allowed
+        return float(np.max(self.error / np.maximum(most, TINY), initial=0.0))
+
+    def relative(self) -> tuple[float, float]:
+        """Return the error and what it may be over the size, of the worst body."""
+        size = np.maximum(self.size, TINY)
+        error, most = self.error / size, (self.allowed + self.rounding) / size
+        return float(np.max(error, initial=0.0)), float(np.max(most, initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -197,8 +208,7 @@ class Tolerances:
     jump: float
     overlap: float  # of nodes without a row: what is more than rounding may bear forces
     balance: float  # force left on a kernel mode
-    energy: float  # norm of the correction in energy, over all bodies
-    rounding: float  # its part that rounding leaves of bodies that do not deform
+    rounding: float  # error of u in energy that rounding leaves of bodies that do not deform
 
 
 class Accuracy(StoppingRule):
@@ -210,21 +220,32 @@ class Accuracy(StoppingRule):
     first look is taken early, to learn how far things move. Creation is not collective; ``examine``
     is, and costs one solve in each subdomain. ``atol`` is a length that errors may have whatever
     moves, ``scale`` b₀, the norm of the residual at the start, and what rounding leaves of it;
-    ``norm`` is ‖F‖, or an estimate: residuals over it are errors of multipliers.
+    ``goal`` an error beside which the algebraic one has to be small, too, or None.
+
+    A rule of one's own overrides ``criteria``.
 
     Attributes:
+        limits: Tolerances beside rtol; those of a class.
         tolerance: Norm of the residuals from which on one looks (again).
         recovered: What the last look has recovered.
         u: This rank's part of its displacement, shape ``(n,)``.
         looks: How many looks there were.
         measures: What the last look has seen, and ``allowed`` the tolerances of that.
-        goal: An error beside which the algebraic one has to be small, too, or None.
-        reached: What looks have seen of that.
+        checks: All that the last look has compared, by name.
+        estimates: With a goal the errors at the last look, and what they have cost at all looks, as
+            in ``Estimates`` of ``accuracy/estimates.py``.
     """
 
+    limits = StoppingTolerances()
     measures: Measures
     allowed: Tolerances
+    checks: dict[str, Criterion]
+    recovered: Recovered
     u: Array
+
+    def __init_subclass__(cls) -> None:
+        if "ratio" in vars(cls):
+            raise InputError(f"{cls.__name__} overrides ratio; expected criteria, which it is of")
 
     def __init__(
         self,
@@ -232,59 +253,74 @@ class Accuracy(StoppingRule):
         rtol: float,
         atol: float,
         scale: tuple[float, float],
-        norm: float = 1.0,
-        limits: StoppingTolerances | None = None,
+        goal: ErrorTarget | None = None,
     ) -> None:
-        self._dual, self.rtol, self._atol = dual, rtol, atol
-        self._limits = limits or StoppingTolerances()
+        self._dual, self.rtol, self._atol, self._goal = dual, rtol, atol, goal
         reference, self._rounding = scale
-        super().__init__(max(rtol**0.5 * reference, atol, self._rounding))
-        self.norm = norm or 1.0
+        # looks for a goal are costly
+        super().__init__(max(rtol**0.5 * reference, atol, self._rounding), waits=goal is not None)
         # where nothing drives any force, rows that only just touch have forces that are rounding
         drives = reference > self._rounding
         self._small = 0.01 * max(rtol * reference, self._rounding) if drives else self._rounding
-        self.looks, self._stopped = 0, False
-        self.recovered: Recovered | None = None
+        self.looks, self._stopped, self._norm = 0, False, 1.0
         self._before: Measures | None = None
-        # of a look with other multipliers: the first one's errors
-        self._least: Array = np.zeros(1)
-        self.goal: ErrorTarget | None = None
-        self.reached: list[TargetStatus] = []
+        self.estimates: dict[str, float] = {}
 
-    def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
-        """Assess an iterate, and return why to stop, or ITERATING. Collective.
+    def criteria(self) -> dict[str, Criterion]:
+        """Return what has to be right, by name, from ``measures``, ``allowed`` and ``rtol``.
 
-        Only in an answer bodies are placed: a rough iterate has forces too small to hold them.
+        A look adds the balance of forces and, with a goal, the algebraic error.
         """
-        self.look(lam, gradient, face, residual)
+        now, allowed, rounding = self.measures, self.allowed, self.allowed.rounding
+        sizes = allowed.displacement / max(self.rtol, self.limits.noise)
+        energy, energy_size = self.limits.energy * self.rtol * now.energy, max(now.energy, rounding)
+        return {
+            "displacement_error": Criterion(self.errors(), allowed.displacement, size=sizes),
+            "penetration": Criterion(now.penetration, allowed.jump),
+            # forces of a body that falls far may be known better than the rounding of its fall
+            "energy_error": Criterion(now.error, energy, rounding, energy_size),
+        }
+
+    def examine(
+        self, lam: Array, gradient: Array, face: Face, residual: float, norm: float
+    ) -> ConvergedReason:
+        """Assess an iterate, and return why to stop, or ITERATING. Collective."""
+        dual, self._norm = self._dual, norm or 1.0
+        # 1. its displacement, beside that of the look before
+        state = recover(dual.constraints, dual.coarse, lam, gradient, face, residual / self._norm)
+        self._before, u = (self.measures, self.u) if self.looks else (None, None)
+        self.looks, self.waits = self.looks + 1, False
+        self._assess(state, measure(dual, state, face, self._norm, u))
         reason = self._verdict(residual)
-        assert self.recovered is not None
-        if self.recovered.loose.count and (reason > 0 or self._stopped):
-            self._place(face)
+        # 2. in an answer bodies that nothing holds are placed: a rough iterate has forces too small
+        # to hold them
+        if state.loose.count and (reason > 0 or self._stopped):
+            unseen = min(self.limits.share_unseen * self.rtol, self.limits.unseen)
+            state = placed(dual.coarse, state, dual.begin, unseen)
+            now = measure(dual, state, face, self._norm)
+            self._assess(state, replace(now, change=self.measures.change))
             reason = self._verdict(residual)
         return reason
 
     def _verdict(self, residual: float) -> ConvergedReason:
         """Return why to stop, or ITERATING, by what the last look has seen. Collective."""
-        given, now = self._limits, self.measures
-        # 1. errors over their tolerances; forces of a body that falls far may be known better
-        # than the rounding of its fall allows, but for those that move nothing beyond rounding
-        moves = now.effect > self._rounding
-        ratio, longest, in_energy, bound = steering(
+        given, now, bounded = self.limits, self.measures, self.checks.get("algebraic_error")
+        # 1. errors over their tolerances, with rounding and, where forces move anything, without
+        ratio, longest, strict, bound = steering(
             self._dual.coarse.comm,
             self.ratio(),
-            self.measures.longest,
-            moves * now.error / max(given.energy * self.rtol * now.energy, TINY),
-            self._over_goal(),
+            now.longest,
+            self.ratio(rounds=now.effect <= self._rounding),
+            bounded.ratio() if bounded else 0.0,
         )
-        if ratio <= 1.0 and (in_energy <= 1.0 or residual <= self._small):
+        if ratio <= 1.0 and (strict <= 1.0 or residual <= self._small):
             return ConvergedReason.CONVERGED_RTOL
         if longest <= self._atol:
             return ConvergedReason.CONVERGED_ATOL
         # 2. residuals at which the next look is worth its price
         aim = 1.0 if bound >= ratio else given.aim  # a bound follows residuals
         least = 1e-4 * min(self._rounding, now.rounding)  # no residual comes down to that
-        tolerance = residual * max(aim / (ratio if ratio > 1.0 else in_energy), given.leap)
+        tolerance = residual * max(aim / (ratio if ratio > 1.0 else strict), given.leap)
         if ratio <= 1.0:
             tolerance = max(tolerance, self._small)
         if tolerance <= least:  # rounding has the last word
@@ -292,37 +328,25 @@ class Accuracy(StoppingRule):
         self.tolerance = float(tolerance)
         return ConvergedReason.ITERATING
 
-    def look(self, lam: Array, gradient: Array, face: Face, residual: float) -> None:
-        """Recover the displacement of an iterate, and measure it. Collective."""
-        dual = self._dual
-        error = residual / self.norm
-        self._measure(recover(dual.constraints, dual.coarse, lam, gradient, face, error), face)
-
-    def _place(self, face: Face) -> None:
-        """Place bodies that nothing holds, and measure the last look again. Collective."""
-        assert self.recovered is not None
-        change, before, looks = self.measures.change, self._before, self.looks
-        del self.reached[looks - 1 :]
-        unseen = min(self._limits.share_unseen * self.rtol, self._limits.unseen)
-        self._measure(placed(self._dual.coarse, self.recovered, self._dual.begin, unseen), face)
-        self.measures = replace(self.measures, change=change)
-        self._before, self.looks = before, looks
-
-    def _measure(self, state: Recovered, face: Face) -> None:
-        """Measure the displacement of an iterate. Collective."""
-        before = None if self.recovered is None else self.recovered.u
-        now = measure(self._dual, state, face, self.norm, before)
-        self._before = self.measures if self.looks else None
+    def _assess(self, state: Recovered, now: Measures) -> None:
+        """Compare the errors of a displacement with their tolerances. Collective with a goal."""
         self.recovered, self.measures, self.u = state, now, state.u
         self.gradient = state.residual
         self.allowed = self._tolerances()
-        self.looks, self.waits = self.looks + 1, False
-        if self.goal is not None:
-            error = energy_bound(self._dual, state.lam, state.u, self.norm)
-            goal = self.goal(state.u)
-            allowed = self._limits.target * max(goal, 1e-5 * now.energy)
-            allowed = max(allowed, self.allowed.rounding)
-            self.reached.append(TargetStatus(*error, goal, now.energy, allowed))
+        self.checks = self.criteria() | {"balance": Criterion(now.balance, self.allowed.balance)}
+        if self._goal is not None:
+            bound, moved = energy_bound(self._dual, state.lam, state.u, self._norm)
+            goal, rounding, known = self._goal(state.u), self.allowed.rounding, self.estimates
+            allowed = max(self.limits.target * max(goal, 1e-5 * now.energy), rounding)
+            self.checks["algebraic_error"] = Criterion(bound, allowed, size=now.energy)
+            self.estimates = {
+                "energy": now.energy,
+                "algebraic": bound,
+                "discretisation": goal,
+                "rounding": rounding,
+                "lifting_multiplications": known.get("lifting_multiplications", 0) + 1,
+                "recoveries": known.get("recoveries", 0) + (moved > 0.0),
+            }
 
     def look_again(self, face: Face) -> bool:
         """Measure the iterate of the last look with another set of multipliers. Collective.
@@ -331,10 +355,11 @@ class Accuracy(StoppingRule):
         has seen stays the least of the errors. Return whether it is right to the tolerance with
         that set, too.
         """
-        assert self.recovered is not None
-        self._least = self.errors()
-        self._measure(self.recovered, face)
-        self._before = None
+        first, self._before = self.checks, None
+        self._assess(self.recovered, measure(self._dual, self.recovered, face, self._norm))
+        for name, now in self.checks.items():
+            error = np.maximum(now.error, first.get(name, now).error)
+            self.checks[name] = now._replace(error=error)
         ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self.measures.longest)
         return bool(ratio <= 1.0 or longest <= self._atol)
 
@@ -342,27 +367,26 @@ class Accuracy(StoppingRule):
         """Assess where a solver has stopped early: errors that rounding explains are accepted."""
         self._small, self._stopped = float("inf"), True
         residual = max(result.projected_gradient, result.norm * result.equality)
-        reason = self.examine(result.lam, result.gradient, result.face, residual)
-        if reason > 0:
-            result.reason = reason
+        reason = self.examine(result.lam, result.gradient, result.face, residual, result.norm)
+        result.reason = reason if reason > 0 else result.reason
 
     def errors(self) -> Array:
         """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``."""
         now, before = self.measures, self._before
         energy = np.sqrt(np.maximum(now.energies, 0.0))
         # where all is rounding, energy does not say how far anything moves
-        noise = self._limits.noise * now.size.max(initial=0.0) + self._at_rest()
+        noise = self.limits.noise * now.size.max(initial=0.0) + self._at_rest()
         noise = np.maximum(noise, self._dual.negligible)
         known = (energy > 0.0) & (now.size > noise)
         shown = np.divide(now.elastic, energy, out=np.zeros_like(energy), where=known)
         estimate = shown * np.sqrt(now.correction_energies)
         if before is not None and before.error > 0.0:
             estimate = np.maximum(estimate, now.change * (now.error / before.error))
-        return np.maximum(estimate + now.correction, self._least)
+        return estimate + now.correction
 
     def _tolerances(self) -> Tolerances:
         """Return the tolerances that the measures are compared with."""
-        now, given = self.measures, self._limits
+        now, given = self.measures, self.limits
         at_rest = self._at_rest()
         most = now.size.max(initial=0.0)
         # a body that is stiff beside another has the error of the other's forces on top
@@ -376,49 +400,25 @@ class Accuracy(StoppingRule):
         displacement = np.maximum(displacement, at_rest)
         # rounding of bodies that do not deform at all: its energy, and forces that make it
         rigid = float(np.sqrt(now.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
-        balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self.norm)
+        balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self._norm)
         return Tolerances(
             displacement=displacement,
             jump=2.0 * largest,
             overlap=2.0 * float(np.maximum(noise, at_rest).max(initial=0.0)),
             balance=balance + all_rest * now.stiffness.max(initial=0.0),
-            energy=given.energy * self.rtol * now.energy + rigid,
             rounding=rigid,
         )
 
-    def ratio(self) -> float:
-        """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
-        now, allowed = self.measures, self.allowed
-        errors = np.array([*self.errors(), now.penetration, now.balance, now.error])
-        limits = np.array([*allowed.displacement, allowed.jump, allowed.balance, allowed.energy])
-        return max(float(np.max(errors / np.maximum(limits, TINY))), self._over_goal())
-
-    def relative_error(self) -> float:
-        """Return the largest estimated error of a body over its largest displacement."""
-        noise = self.allowed.displacement / max(self.rtol, self._limits.noise)
-        return float(np.max(self.errors() / np.maximum(noise, TINY), initial=0.0))
-
-    def energy_error(self) -> tuple[float, float]:
-        """Return estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
-
-        Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
-        """
-        now, allowed = self.measures, self.allowed.energy
-        size = max(now.energy, allowed, TINY)
-        return now.error / size, allowed / size
+    def ratio(self, rounds: bool = True) -> float:
+        """Return the largest ratio of errors at the last look; u is right if it is at most 1."""
+        return float(np.max([check.ratio(rounds) for check in self.checks.values()]))
 
     def _at_rest(self) -> Array:
         """The size of displacements that are rounding of 0, of bodies without a load, else 0."""
         now = self.measures
-        small = self._limits.load_noise * now.gap
+        small = self.limits.load_noise * now.gap
         return np.where((now.alone == 0.0) & (now.size <= small), small, 0.0)
 
-    def _over_goal(self) -> float:
-        """Return the bound at the last look over what the goal allows; 0 without a goal."""
-        if not self.reached:
-            return 0.0
-        return self.reached[-1].bound / max(self.reached[-1].allowed, TINY)
 
-
-# from the dual problem, rtol, atol, b₀ with what rounding leaves of it, and ‖F‖ to a stopping rule
-MakeRule = Callable[[Dual, float, float, tuple[float, float], float], Accuracy]
+# from the dual problem, rtol, atol, b₀ with what rounding leaves of it, and a goal, to a rule
+MakeRule = Callable[[Dual, float, float, tuple[float, float], ErrorTarget | None], Accuracy]

@@ -245,7 +245,8 @@ def solve_by_pcpg(
 
 def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
     """Apply the stopping rule to the point."""
-    return rule.examine(point.lam, point.g, qp.feasible.face(point.lam, point.g), norm)
+    face = qp.feasible.face(point.lam, point.g)
+    return rule.examine(point.lam, point.g, face, norm, qp.norm)
 
 
 def _begun(qp: QP, point: Point, own: Directions) -> tuple[Along | None, float]:

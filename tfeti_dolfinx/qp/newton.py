@@ -246,8 +246,7 @@ class NewtonIteration:
         """Apply the stopping rule where ‖g^P‖ is small enough."""
         if self.residual > max(rule.tolerance, self.rounding):
             return ConvergedReason.ITERATING
-        rule.norm = self.norm
-        reason = rule.examine(self.z.lam, self.s, self.pressed, self.residual)
+        reason = rule.examine(self.z.lam, self.s, self.pressed, self.residual, self.norm)
         if reason == ConvergedReason.ITERATING and self.qp.rough is not None:
             self.z = self.z if rule.gradient is None else Point(self.z.lam, rule.gradient)
         return reason

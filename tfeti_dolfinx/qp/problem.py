@@ -284,19 +284,19 @@ class StoppingRule:
     """
 
     tolerance: float  # norm of the residuals from which on an examination is worth its price
-    # ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that learns it on
-    # its way says so here
-    norm: float = 1.0
     # whether an examination is to wait for solves on faces, whatever they aim at
     waits: bool = False
     # Fλ − d of the iterate examined, if the examination has found it; it is exact
     gradient: Array | None = None
 
-    def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
+    def examine(
+        self, lam: Array, gradient: Array, face: Face, residual: float, norm: float
+    ) -> ConvergedReason:
         """Examine an iterate whose residuals are small. Collective.
 
-        ``gradient`` is Fλ − d up to the range of Gᵀ, ``residual`` max(‖g^P‖, ‖F‖‖Qx‖). Return why
-        to stop, or ITERATING; then ``tolerance`` is below ``residual``.
+        ``gradient`` is Fλ − d up to the range of Gᵀ, ``residual`` max(‖g^P‖, ‖F‖‖Qx‖), ``norm``
+        ‖F‖, or an estimate: residuals over it are errors of multipliers. Return why to stop, or
+        ITERATING; then ``tolerance`` is below ``residual``.
         """
         small = residual <= self.tolerance
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING

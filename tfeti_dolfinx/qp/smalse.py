@@ -96,7 +96,7 @@ class InnerTest:
     def examine(self, state: MprgpIterate, equality: float) -> float:
         """Apply the stopping rule, given ‖Q(λ − λ̄)‖; return the residual. Collective."""
         residual = max(state.projected_gradient, self._qp.norm * equality)
-        self.reason = self._rule.examine(state.x, state.g, state.face, residual)
+        self.reason = self._rule.examine(state.x, state.g, state.face, residual, self._qp.norm)
         return residual
 
     def update(self, lagrangian: float, equality: float) -> None:

@@ -73,6 +73,7 @@ class FixedPointStatus:
     body: int = -1  # that on which they changed most at last; -1 without Coulomb's law
     newton_steps: int = 0  # steps of Newton's method on Coulomb's law, beside the problems
     slides: str = ""  # what friction does not hold, in words
+    looks: int = 0  # assessments of all problems
 
 
 def solve_with_friction(
@@ -96,7 +97,7 @@ def solve_with_friction(
         dual.bound_friction(None)  # there may have been coefficients
         solved = solve_dual(dual, options, qp_type, start, monitor, goal, make_rule)
         slides = _slides(dual, *solved, None, parameters.slips)
-        return *solved, FixedPointStatus(slides=slides)
+        return *solved, FixedPointStatus(slides=slides, looks=solved[1].looks)
     least = options.number if goal is None else parameters.with_target * options.friction_rtol
     tolerance = min(options.friction_rtol, parameters.beside_rtol * least)
     bounds = FrictionBounds(dual, start, parameters)
@@ -151,10 +152,10 @@ def solve_with_friction(
         if motion is not None or idle or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
-    result.steps, rule.looks = steps, looks
+    result.steps = steps
     slides = _slides(dual, result, rule, motion, parameters.slips)
-    status = FixedPointStatus(iterations, change, tolerance, bounds.body, newton.steps, slides)
-    return result, rule, status
+    at_rest = change, tolerance, bounds.body
+    return result, rule, FixedPointStatus(iterations, *at_rest, newton.steps, slides, looks)
 
 
 def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, most: float) -> str:
@@ -165,7 +166,7 @@ def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, 
     """
     state, coarse = rule.recovered, dual.coarse
     known = motion is not None or result.reason == ConvergedReason.DIVERGED_CONTRADICTION
-    if not known and state is not None and dual.contact_rows[1] and coarse.dimension:
+    if not known and dual.contact_rows[1] and coarse.dimension:
         slip, bends = (np.abs(x) / coarse.row_size for x in (state.gap, state.residual))
         rubs = coarse.rubbing[state.active[coarse.rubbing]]  # what is let go may go anywhere
         if largest(coarse.comm, slip[rubs]) > most * largest(coarse.comm, bends):

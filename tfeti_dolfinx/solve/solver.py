@@ -122,8 +122,7 @@ def solve_dual(
         monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
     rtol = options.number if rtol is None else rtol
     scale = homogenised.reference, homogenised.rounding
-    rule = make_rule(dual, rtol, options.atol, scale, qp.norm)
-    rule.goal, rule.waits = goal, goal is not None  # assessments against a target are costly
+    rule = make_rule(dual, rtol, options.atol, scale, goal)
     own, most = getattr(options, qp_type, solver.parameters), options.max_it
     result = solver.solve(
         qp, homogenised, rule, own, max_it=most, start=begin, monitor=monitor or no_monitor
@@ -137,8 +136,8 @@ def solve_dual(
         dual.rough = None  # what single precision does not tell: begin again with F itself
         return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
-    if (state := rule.recovered) is not None:
-        dual.last.looked = state.lam, state.residual
+    if rule.looks:
+        dual.last.looked = rule.recovered.lam, rule.recovered.residual
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
     if result.reason <= 0 and (options.max_it > 0 or rule.looks == 0):  # else a look was all
