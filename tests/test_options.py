@@ -31,16 +31,13 @@ def test_values_get_the_type_of_their_option_and_the_command_line_beats_the_dict
     assert parse_options({"tfeti_rtol": 1e-9}, "tfeti_").rtol == 1e-9
 
 
-def test_named_mechanisms_are_switched_off():
+def test_named_mechanisms_are_switched_off_and_view_lists_every_option():
     options = parse_options({"without": "d_scaling, recycled_directions,late_schur"}, "tfeti_")
     assert options.without == ("d_scaling", "recycled_directions", "late_schur")
     for given, taken in (("auto", "dirichlet"), ("lumped", "lumped")):
         assert resolved(replace(options, pc_type=given), (1, 0), "tfeti_").pc_type == taken
     assert resolved(replace(options, qp_type="smalse"), (1, 0), "tfeti_").pc_type == "none"
     assert (options.scaling, options.recycle) == ("multiplicity", 0)
-
-
-def test_view_lists_every_option():
     text = Options().view_text("tfeti_")
     for option in parameters_of(Options):
         assert f"-tfeti_{option.name} {option.default}" in text

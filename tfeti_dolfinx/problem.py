@@ -536,9 +536,8 @@ class ContactProblem:
         system = self._system
         system.tools.go_back(state.tools)
         self._take_motion(state)
-        system.know_rows(
-            list(state.reach), state.groups(self.dofs), list(map(int, state.secondary))
-        )
+        secondary = list(map(int, state.secondary))
+        system.know_rows(list(state.reach), state.groups(self.dofs), secondary)
         system.look_for_changes()
         dual = system.make(self._seconds)
         dual.seen = max(dual.seen, float(state.norm))
@@ -553,7 +552,7 @@ class ContactProblem:
         solution = self._make_solution(state.u, Multipliers(state.lam, face), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
-        self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
+        system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
 
     # ------------------------------------- what bodies with mass and nonlinear ones add
 

@@ -1,7 +1,6 @@
 """The solution of a problem: fields, contact data, values at points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -35,12 +34,14 @@ from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin
 from tfeti_dolfinx.forms.fields import (
+    PointValues,
     Stress,
     StressRecovery,
     cellwise,
     from_vertices,
     frozen,
     nodal,
+    value_row,
     von_mises,
 )
 from tfeti_dolfinx.mortar.facets import (
@@ -52,33 +53,10 @@ from tfeti_dolfinx.mortar.facets import (
 )
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
-# --- Displacement and stress at given points --------------------------------------------------
-
-# Of the size of the mesh: how far from a cell of finite elements a point may be
+# of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
 # a length: how far it may be for DOLFINx, whatever the size of the mesh
 OF_DOLFINX = 1e-6
-
-
-@dataclass(frozen=True)
-class PointValues:
-    """Values at points; not a number where a point is in no body.
-
-    Attributes:
-        displacement: Shape ``(k, gdim)``.
-        stress: Shape ``(k, gdim, gdim)``, in 2D without σ_zz.
-    """
-
-    displacement: Array
-    stress: Array
-
-
-def value_row(u: Array, stress: Array) -> Array:
-    """Return a row for each point: 1, displacement and stress."""
-    return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
-
-
-# --- The solution -----------------------------------------------------------------------------
 
 
 class Solution:
@@ -495,10 +473,9 @@ class Solution:
 
     @cached_property
     def forced_slip(self) -> Array:
-        """Slips along tangents that are prescribed, ``(n, gdim - 1)``. Collective at first use.
-
-        Where they are not, they are no numbers.
-        """
+        """Slips along tangents that are prescribed, else no numbers; collective at first use."""
+        if self.friction is None:
+            return np.full(self.gluing.slip.shape, np.nan)
         slip = self.gluing.forced_slip()
         slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
         return slip
@@ -574,7 +551,7 @@ class Solution:
         gluing, rows = self.gluing, self.gluing.tangents
         at, end = gluing.constraints.sets.tangents, self._motion[1]
         rubs = np.any(self.lam[at] != 0.0, axis=1) & np.all(self.holding[at] | ~rows.moves, axis=1)
-        forced, kept = gluing.slip + gluing.forced_slip(), np.zeros(end.shape, dtype=bool)
+        forced, kept = gluing.slip + self.forced_slip, np.zeros(end.shape, dtype=bool)
         end = np.where(np.isnan(forced), end, forced)
         kept[rows.condition] = rubs[:, None] & rows.moves
         return np.where(kept, gluing.slip, end)

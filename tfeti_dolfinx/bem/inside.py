@@ -15,7 +15,7 @@ from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.bem.steklov import Steklov, gunter, rigid_motions
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.solution import value_row
+from tfeti_dolfinx.forms.fields import value_row
 
 # --- Somigliana's identity: displacement and stress inside ------------------------------------
 

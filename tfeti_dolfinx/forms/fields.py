@@ -1,6 +1,7 @@
 """Stress fields, nodal averages over cells and tears, and the discretisation error."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,24 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import NO_TAG
 
 Stress = Callable[[Any], Any]
+
+
+@dataclass(frozen=True)
+class PointValues:
+    """Values at points; not a number where a point is in no body.
+
+    Attributes:
+        displacement: Shape ``(k, gdim)``.
+        stress: Shape ``(k, gdim, gdim)``, in 2D without σ_zz.
+    """
+
+    displacement: Array
+    stress: Array
+
+
+def value_row(u: Array, stress: Array) -> Array:
+    """Return a row for each point: 1, displacement and stress."""
+    return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
 
 
 def von_mises(sigma: Any) -> Any:
