@@ -16,6 +16,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from scipy.sparse import csr_array
+from ufl.algorithms import estimate_total_polynomial_degree
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
@@ -234,9 +235,10 @@ def mass_form(
     degree = V.element.basix_element.degree
     if lumped and degree != 1:
         raise InputError(f"lumped=True on elements of degree {degree}; expected degree 1")
-    rule = {"quadrature_rule": "vertex", "quadrature_degree": 1} if lumped else None
-    dx = ufl.Measure("dx", domain=decomposition.mesh, metadata=rule)
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    product = rho * ufl.inner(u, v)
     is_one = isinstance(thickness, float) and thickness == 1.0
-    return product * dx if is_one else thickness * product * dx
+    per_area = rho if is_one else thickness * rho
+    rule = {"quadrature_degree": 2 * degree + int(estimate_total_polynomial_degree(per_area))}
+    if lumped:
+        rule = {"quadrature_rule": "vertex", "quadrature_degree": 1}
+    dx = ufl.Measure("dx", domain=decomposition.mesh, metadata=rule)
+    return per_area * ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * dx
