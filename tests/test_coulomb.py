@@ -95,6 +95,9 @@ def test_a_block_that_is_drawn_by_its_side_rubs_there_too(cell, law, comm):
             slides = data.status == tfeti.ContactStatus.SLIP
             assert comm.allreduce(int(slides.sum())) == (5 if force else 4)
         p.accept()
+    q = tfeti.ContactDynamics(a, L, bcs, p.contacts, d, mass=1.0, petsc_options=options)
+    for record in tfeti.LoadSteps(q, lambda q, t: setattr(way, "value", -0.1 * t), [0.5, 1]).run():
+        assert record.motion["friction"] == pytest.approx(-record.dissipation, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -46,14 +46,11 @@ def test_springs_in_clusters():
         assert counted <= 1.5 * without
 
 
-def test_springs_are_soft_in_the_mean():
+def test_springs_are_soft_in_the_mean_and_do_not_change_the_answer():
     """Those of a ring differ: without its softest ones alone a subdomain does not float."""
     stiffnesses = (np.diag([0.1, stiff, 1.0]) for stiff in (1.0, 20.0))
     found = [Springs.of(np.eye(3)[:, :2], K.__matmul__, 1.0) for K in stiffnesses]
     assert [springs is None for springs in found] == [False, True]
-
-
-def test_they_do_not_change_the_answer():
     p, q = (foundation(1e-3, without=name, rtol=1e-10) for name in ("cautious", "soft_springs"))
     for each in (p, q):
         each.solve()

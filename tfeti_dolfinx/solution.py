@@ -469,7 +469,7 @@ class Solution:
         force = np.zeros(records.normal.shape)
         along = np.einsum("tk,tkg->tg", lam, records.tangents[rows.condition])
         force[rows.condition] = -rows.scale[:, None] * along
-        return force + self._forced_friction
+        return force + self.forced_friction
 
     @cached_property
     def forced_slip(self) -> Array:
@@ -481,7 +481,7 @@ class Solution:
         return slip
 
     @cached_property
-    def _forced_friction(self) -> Array:
+    def forced_friction(self) -> Array:
         """Its part along what is prescribed, where all slip is: rows have none. Collective."""
         records = self.gluing.records
         if self.friction is None:
@@ -578,7 +578,7 @@ class Solution:
         rubbing = np.where(held, ContactStatus.STICK, ContactStatus.SLIP)
         closed = np.isin(rows.condition, np.concatenate((touching, decided)))
         status[rows.condition[closed]] = rubbing[closed]
-        status[np.any(self._forced_friction, axis=1)] = ContactStatus.SLIP
+        status[np.any(self.forced_friction, axis=1)] = ContactStatus.SLIP
         return status
 
     @cached_property

@@ -17,6 +17,7 @@ from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
+from tfeti_dolfinx.contact.records import relative_displacement
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
@@ -59,12 +60,18 @@ def balance(
     sets, primal = dual.constraints.sets, solution.dofs.to_primal(way)
     done = -solution.lam * dual.constraints.jumps(primal[dual.subdomains.trace])  # −λᵀB Δu
     M, moving = inertia.M, motion.v @ (inertia.M @ motion.v)
+    of_rows = [done[r].sum() for r in (sets.normals, sets.tangents.ravel(), sets.equalities)]
+    # supports that draw nodes along bear their friction, too
+    rubs = 0.0
+    if solution.friction is not None:
+        drawn = relative_displacement(solution.gluing.records, solution.dofs, primal)
+        rubs = np.sum(solution.forced_friction * drawn)
     own = [
         0.5 * v @ (M @ v),
         forms.elastic(u),
         0.5 * moving + forms.elastic(motion.u),
         0.5 * (motion.load + inertia.ends) @ way,
-        *(done[rows].sum() for rows in (sets.normals, sets.tangents.ravel(), sets.equalities)),
+        *np.add(of_rows, (0.0, rubs, -rubs)),
         (0.0 if start is motion.v else 0.5 * (start @ (M @ start) - moving))
         - 2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
     ]
