@@ -482,7 +482,7 @@ class Solution:
 
     @cached_property
     def forced_friction(self) -> Array:
-        """Its part along what is prescribed, where all slip is: rows have none. Collective."""
+        """Friction of nodes that are made to slip, ``(n, gdim)``, else 0. Collective at first."""
         records = self.gluing.records
         if self.friction is None:
             return np.zeros(records.normal.shape)
