@@ -455,6 +455,9 @@ class System(Generic[OwnForms]):
         values, records = made(self._prescribed).value, self.search.records
         gluing = replace(self.gluing, records=replace(self.gluing.records, motion=records.motion))
         self._gluing = gluing.with_right_side(values, records.gap, self._slip())
+        before, after = gluing.tangents.drawn, self._gluing.tangents.drawn
+        if any_rank(self._dofs.comm, not np.array_equal(before, after)):
+            self.change("friction")
 
     def _set_friction_limits(self) -> None:
         """Fill the ψ_i of the rows, and the μ_i under Coulomb's law."""

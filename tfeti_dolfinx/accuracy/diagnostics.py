@@ -95,8 +95,6 @@ class WarningLimits:
     stands_out: float = 2.0
     # a gap below 0 that a mesh has, over the largest displacement: forces follow from it then
     overlaps: float = 0.1
-    # of the slip of a node, what conditions prescribe along one direction: friction is another then
-    drawn: float = 0.3
     listed: int = 3  # bodies that a sentence names
 
 
@@ -132,7 +130,6 @@ class Diagnostics:
             *self._rounding(dual, u, energy, rtol),
             *self._turned(u, dual.subdomains),
             *self._facets(solution, dual.subdomains),
-            *_drawn(solution),
             *self._lasting,
             *_of_estimates(outcome),
         ]
@@ -295,30 +292,6 @@ class Diagnostics:
         listed = ", ".join(names[body] for body in some[: LIMITS.listed])
         rest = len(some) - LIMITS.listed
         return f"{listed} and {rest} more" if rest > 0 else listed
-
-
-def _drawn(solution: Solution) -> Iterator[str]:
-    """Nodes that are made to slip along one of two tangents, of which rows know nothing."""
-    if not solution.has_friction:
-        return
-    forced, slip, records = (
-        solution.forced_slip,
-        solution.slip_of_conditions,
-        solution.gluing.records,
-    )
-    along = np.abs(np.einsum("ntg,ng->nt", records.tangents, slip))
-    limit = LIMITS.drawn * np.linalg.norm(slip, axis=1, keepdims=True)
-    drawn = np.any((np.abs(forced) > 0.0) & (along > limit), axis=1)
-    drawn &= np.any(np.isnan(forced), axis=1)
-    own = records.contact[drawn & (solution.force > 0.0)]
-    count = np.bincount(own, minlength=len(solution.contacts))
-    solution.dofs.comm.Allreduce(MPI.IN_PLACE, count)
-    for i in np.flatnonzero(count):
-        yield (
-            f"{solution.contacts[i].name}: {count[i]} node{'s are' if count[i] > 1 else ' is'} "
-            "made to slip along one direction, and free along the other: friction along the first "
-            "is left out, and along the other may be too large; expected smaller elements there"
-        )
 
 
 def with_estimates(report: Report, numbers: dict[str, float]) -> Report:

@@ -122,17 +122,22 @@ class TangentRows:
     # under Coulomb's law the normal row of the same condition, as a position in `RowSets.normals`,
     # else −1, shape (t,)
     normal: Array
+    # whether conditions make the node of a row without entries slip along it, while it moves along
+    # the other tangent: friction is then against both slips, shape (t, gdim - 1)
+    drawn: Array
 
     def bounds(self, values: Array, area: Array) -> tuple[Array, Array]:
         """Return ψ_i = traction · ∫φ_i / s_i, semi-axes of what λ_T may be, and Coulomb's μ_i.
 
-        Both have the shape ``(t, gdim - 1)``; one of them is 0, and on empty rows both. Tractions
-        or coefficients, ``(n, gdim - 1)``, and areas ∫φ_i, ``(n,)``, are those of all conditions.
+        Both have the shape ``(t, gdim - 1)``; one of them is 0, and both where nothing can slip.
+        Tractions or coefficients, ``(n, gdim - 1)``, and areas ∫φ_i, ``(n,)``, are those of all
+        conditions.
         """
         over = (area[self.condition] / self.scale)[:, None]
         own, given = values[self.condition], (self.normal < 0)[:, None]
-        limits = np.where(self.moves & given, own * over, 0.0)
-        return limits, np.where(self.moves & ~given, own, 0.0)
+        slides = self.moves | self.drawn
+        limits = np.where(slides & given, own * over, 0.0)
+        return limits, np.where(slides & ~given, own, 0.0)
 
 
 def tangent_rows(
@@ -147,7 +152,7 @@ def tangent_rows(
     if not any_rank(dofs.comm, records.friction != Friction.NONE):
         none, number = np.empty(0, dtype=np.int64), np.empty(0)
         moves = np.empty((0, count), dtype=bool)
-        return Rows(none, none, none, number), TangentRows(none, number, moves, none)
+        return Rows(none, none, none, number), TangentRows(none, number, moves, none, moves)
     of_axes = [builder.left(1 + k) for k in range(count)]
     squares, left, share = np.array(of_axes).transpose(1, 2, 0)
     left = left * (share > TOLERANCES.little_left)
@@ -166,4 +171,4 @@ def tangent_rows(
     place = np.arange(len(rows)).reshape(-1, count).T.ravel()
     group = np.repeat(records.group[condition], count)
     rows = Rows(group, place[rows.row], rows.column, rows.value)
-    return rows, TangentRows(condition, scale, moves, row[condition])
+    return rows, TangentRows(condition, scale, moves, row[condition], np.zeros_like(moves))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import space_of
-from tfeti_dolfinx.common.parallel import any_rank, count_over, least
+from tfeti_dolfinx.common.parallel import any_rank, count_over, largest, least
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.constraints.contact_rows import (
     ContactRows,
@@ -255,7 +256,7 @@ class Gluing:
         """Return this rank's part of c, shape ``(num_rows,)``. Collective."""
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
-        held, left, rounding = self._held()
+        held, left, rounding = self._held
         decided, comm = left[normals.decided], self.dofs.comm
         wrong = decided < -rounding[normals.decided]
         overlaps = count_over(comm, wrong)
@@ -272,12 +273,13 @@ class Gluing:
         values = self.prescribed.value.ravel()[self.held.component]
         c[sets.equalities[self.held.row]] = values * self.held.factor
         c[sets.normals] = left[normals.condition] * normals.scale
-        c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
+        slides = tangents.moves | tangents.drawn
+        c[sets.tangents] = np.where(slides, slips * tangents.scale[:, None], 0.0)
         return c
 
     def closed(self) -> Array:
         """Return the conditions that prescribed components decide and that touch. Collective."""
-        at, (_, left, rounding) = self.contact.decided, self._held()
+        at, (_, left, rounding) = self.contact.decided, self._held
         return np.asarray(at[np.abs(left[at]) <= rounding[at]])
 
     def forced_slip(self) -> Array:
@@ -286,15 +288,16 @@ class Gluing:
         They are those of conditions with friction and a normal row; others are not numbers.
         Collective.
         """
-        along = np.einsum("ntg,ng->nt", self.records.tangents, self._held()[0])
+        along = np.einsum("ntg,ng->nt", self.records.tangents, self._held[0])
         forced = np.zeros(along.shape, dtype=bool)
         forced[self.contact.condition] = True
         forced[self.records.friction == Friction.NONE] = False
         forced[self.tangents.condition] &= ~self.tangents.moves
         return np.where(forced, along - self.slip, np.nan)
 
+    @cached_property
     def _held(self) -> tuple[Array, Array, Array]:
-        """Return what prescribed components make of all v_i, and what that leaves of gaps.
+        """All v_i of prescribed components, and what they leave of gaps. Collective at first use.
 
         And the slack of these: facets of curved surfaces may overlap where bodies do not.
         """
@@ -319,8 +322,21 @@ class Gluing:
             records=replace(self.records, gap=gaps),
             slip=self.slip if slip is None else slip,
         )
+        gluing = replace(gluing, tangents=replace(self.tangents, drawn=gluing._drawn()))
         self.constraints.c[:] = gluing.right_side()
         return gluing
+
+    def _drawn(self) -> Array:
+        """Return ``TangentRows.drawn``: slips that are more than rounding. Collective."""
+        moves, at = self.tangents.moves, self.tangents.condition
+        if self.dofs.bs < 3:
+            return np.zeros_like(moves)
+        values, motion = self.prescribed.value, self.records.motion
+        known = np.concatenate([x.ravel() for x in (values, motion, self.slip)])
+        least_slip = TOLERANCES.still * largest(self.dofs.comm, known)
+        along = np.einsum("ntg,ng->nt", self.records.tangents[at], self._held[0][at])
+        slips = np.abs(along - self.slip[at])
+        return ~moves & np.any(moves, axis=1)[:, None] & (slips > least_slip)
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
@@ -397,8 +413,7 @@ def glue(
     slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
     gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)
     try:
-        constraints.c[:] = gluing.right_side()
+        return gluing.with_right_side(prescribed.value, records.gap)
     except TfetiError:  # on all ranks
         constraints.B.destroy()
         raise
-    return gluing

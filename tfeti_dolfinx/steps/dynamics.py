@@ -61,11 +61,12 @@ def balance(
     done = -solution.lam * dual.constraints.jumps(primal[dual.subdomains.trace])  # −λᵀB Δu
     M, moving = inertia.M, motion.v @ (inertia.M @ motion.v)
     of_rows = [done[r].sum() for r in (sets.normals, sets.tangents.ravel(), sets.equalities)]
-    # supports that draw nodes along bear their friction, too
+    # rows know nothing of prescribed components: supports that draw nodes bear their friction
     rubs = 0.0
     if solution.friction is not None:
-        drawn = relative_displacement(solution.gluing.records, solution.dofs, primal)
-        rubs = np.sum(solution.forced_friction * drawn)
+        records = solution.gluing.records
+        along = relative_displacement(records, solution.dofs, primal) + records.motion
+        rubs = np.sum(solution.tangential_force * along) - of_rows[1]
     own = [
         0.5 * v @ (M @ v),
         forms.elastic(u),
