@@ -60,8 +60,7 @@ def test_a_block_that_is_drawn_along_slides_at_its_capacity(comm):
     d, press, angle = decomposed("hexahedron", 3, 2), 0.1, 0.3
     law = tfeti.Coulomb(MU, direction=(1, 0, 0))
     V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0, 0.0), d.surface("top"))
-    value = np.array([5.0 * np.cos(angle), 5.0 * np.sin(angle), -press])
-    bcs = [clamp(V, d.facets("top"), value)]
+    bcs = [clamp(V, d.facets("top"), (5.0 * np.cos(angle), 5.0 * np.sin(angle), -press))]
     p = tfeti.ContactProblem(a, L, bcs, [floor(3, law)], d, petsc_options={"rtol": 1e-7})
     p.solve()
     assert p.report.sticking == 0
@@ -84,14 +83,13 @@ def test_a_block_that_is_drawn_by_its_side_rubs_there_too(cell, law, comm):
     left = fem.locate_dofs_topological(V.sub(0), gdim - 1, d.facets("left"))
     bcs, options = [fem.dirichletbc(way, left, V.sub(0))], {"rtol": 1e-9}
     p = tfeti.ContactProblem(a, L, bcs, [floor(gdim, law)], d, petsc_options=options)
-    for way.value, force in ((0.05, -0.003), (-0.05, 0.003), (-0.05, None)):
+    for way.value, force in ((0.5, -0.003), (-0.5, 0.003), (-0.5, None)):
         p.solve()
+        assert p.report.F_multiplications < 55
         data, draws = p.solution.contact(), p.solution.reaction("left").force[0]
         assert data.resultant.force[0] == pytest.approx(-draws, abs=1e-10)
-        slides = data.status == tfeti.ContactStatus.SLIP
-        assert gdim == 3 or comm.allreduce(int(slides.sum())) == (5 if force else 4)
         if force:
-            assert np.all(slides)
+            assert np.all(data.status == tfeti.ContactStatus.SLIP)
             assert -draws == pytest.approx(force, rel=1e-3)
             bound = 0.3 * data.pressure if isinstance(law, tfeti.Coulomb) else 0.003
             against = -np.abs(bound / np.linalg.norm(data.slip, axis=1))[:, None] * data.slip

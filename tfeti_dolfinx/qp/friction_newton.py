@@ -1,7 +1,7 @@
 """Newton's method on Coulomb's law itself, by generalised conjugate residuals."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -31,7 +31,7 @@ class FrictionParameters:
     max_directions: int = 80  # most directions of one solve
     # of the target: F of a way onto a face that is shorter, times ‖F‖, is not computed
     unseen: float = 0.1
-    hard: float = 10.0  # times ‖F‖: directions that bend more are held
+    hard: float = 3.0  # times ‖F‖: directions that bend more are scaled down to it
     new: float = 1e-7  # of Az: what earlier directions leave of it, less is rounding
     gain: float = 1e-8  # of the residual: what a direction takes from it, less is no gain
     rounding: float = 1e-16  # of a residual: no λ that has it comes lower
@@ -141,10 +141,9 @@ def newton_on_law(
         best = min(best, residual)
         if idle > parameters.patience or not parameters.rounding * residual <= target:
             return None, step
-        # Step 2: the face of p, and what follows where points slip; P itself turns what bends hard
+        # Step 2: the face of p, and what follows where points slip
         face = feasible.face(p, at.s)
-        soft = np.flatnonzero(face.curvature <= parameters.hard * program.norm)
-        on = OnFace(face.with_tangents(soft), program.law.following(p, face), p)
+        on = OnFace(face, program.law.following(p, face), p)
         # Step 3: the system there
         share = parameters.reduction
         if past:
@@ -196,7 +195,10 @@ def _solved_on_face(
 ) -> LawPoint:
     """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0, Gλ = e on a face, λ = λ₁ + (I + C)u, but for a share."""
     qp, comm = program.qp, program.qp.coarse.comm
-    oblique = program.oblique(on.face, on.C)
+    # t/√w in the place of t: what bends hard takes over no step, and is there to balance loads
+    w = np.maximum(1.0, on.face.curvature / (parameters.hard * program.norm))
+    scaled = replace(on.face, tangents=(on.face.tangents.T / np.sqrt(w)).T)
+    oblique = program.oblique(scaled, on.C)
     M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
 
     def apply(z: Array) -> tuple[Array, Array]:
@@ -204,7 +206,8 @@ def _solved_on_face(
         return oblique.project(Fz + on.face.bend(z)), Fz
 
     def precondition(r: Array) -> Array:
-        return oblique.project(on.face.restricted(r) if M is None else M(r))
+        z = on.face.restricted(r) if M is None else M(r)
+        return oblique.project(z + on.face.along_tangents(z, w - 1.0))
 
     # Step 3a: λ₁ on the face, and u that restores Gλ = e; s is of λ before
     lam, s = on.entered(at.lam), at.s

@@ -106,15 +106,15 @@ class Face:
         """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
         own = np.asarray((x.T * self.free).T)
         if len(self.tangents):
-            own += self._along_tangents(x, np.ones(len(self.tangents)))
+            own += self.along_tangents(x, np.ones(len(self.tangents)))
         return own
 
     def bend(self, x: Array) -> Array:
         """Z diag(κ) Zᵀ x, shapes ``(m,)`` or ``(m, q)``."""
-        return self._along_tangents(x, self.curvature)
+        return self.along_tangents(x, self.curvature)
 
-    def _along_tangents(self, x: Array, weights: Array) -> Array:
-        """T diag(weights) Tᵀ x, T the tangents as columns."""
+    def along_tangents(self, x: Array, weights: Array) -> Array:
+        """T diag(weights) Tᵀ x, T the tangents as columns, shapes ``(m,)`` or ``(m, q)``."""
         y = np.zeros(x.shape)
         if len(self.tangents):
             along = np.einsum("tw,tw...,t->t...", self.tangents, x[self.tangent_rows], weights)
