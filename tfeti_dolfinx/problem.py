@@ -18,7 +18,6 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.validation import checked_number, checked_type
-from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import (
     Gluing,
     check_conditions,
@@ -305,10 +304,9 @@ class ContactProblem:
                 lam[let_go(dual.coarse, state)] = 0.0
         # 2. their displacement
         with stage("recovery", seconds):
-            multipliers = Multipliers(lam, result.face)
             nodal = dual.subdomains.num_nodal
             system.tools.take(accuracy.u[nodal:])
-            solution = self._make_solution(accuracy.u[:nodal], multipliers, gluing)
+            solution = self._make_solution(accuracy.u[:nodal], lam, result.face, gluing)
             self._solution = solution
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         end = gluing, lam, result.mu, system.inverses
@@ -348,14 +346,15 @@ class ContactProblem:
         self.report.take(Report.composed(records, self._seconds, self._in_all, comm))
         self._seconds, self._in_all = {}, self.report.in_all
 
-    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+    def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
         tools = self._system.tools
         if tools:
             motion = tools.motion(gluing.records, found=True)
             gluing = replace(gluing, records=replace(gluing.records, motion=motion))
         solution = Solution(
             u=u,
-            multipliers=multipliers,
+            lam=lam,
+            face=face,
             gluing=gluing,
             contacts=list(self._system.search.contacts),
             stress=None if self._stress is None else self._stress.frozen(),
@@ -549,7 +548,7 @@ class ContactProblem:
         dual.last.take(self.dofs.comm, state.lam, state.image)
         # a face that only knows what rows do
         face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
-        solution = self._make_solution(state.u, Multipliers(state.lam, face), gluing)
+        solution = self._make_solution(state.u, state.lam, face, gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
         system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))

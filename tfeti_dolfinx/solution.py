@@ -11,12 +11,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, largest
-from tfeti_dolfinx.constraints.contact_state import (
-    ContactData,
-    ContactStatus,
-    Multipliers,
-    ToolState,
-)
+from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus, ToolState
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -52,6 +47,7 @@ from tfeti_dolfinx.mortar.facets import (
     surface_facets,
 )
 from tfeti_dolfinx.mortar.tolerances import SEARCH
+from tfeti_dolfinx.qp.sets import Face
 
 # of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
@@ -86,14 +82,15 @@ class Solution:
     def __init__(
         self,
         u: Array,
-        multipliers: Multipliers,
+        lam: Array,
+        face: Face,
         gluing: Gluing,
         contacts: Sequence[ContactPartner] = (),
         stress: Stress | None = None,
         thickness: Any = 1.0,
     ) -> None:
-        self.u, self.lam = u, multipliers.lam
-        self.carrying, self.holding = multipliers.face.carrying, multipliers.face.holding
+        self.u, self.lam = u, lam
+        self.carrying, self.holding = face.carrying, face.holding
         self.gluing, self.dofs, self.decomposition = gluing, gluing.dofs, gluing.dofs.decomposition
         self.contacts, self.thickness = list(contacts), frozen(thickness)
         self.tool_motions: Sequence[ToolMotion] = ()

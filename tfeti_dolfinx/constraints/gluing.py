@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import space_of
@@ -36,22 +37,14 @@ from tfeti_dolfinx.mortar.facets import facet_nodes
 # --- Rows of interfaces and Dirichlet conditions ----------------------------------------------
 
 
-@dataclass(frozen=True)
-class HeldRows:
-    """The equality rows that hold prescribed components; the others have right sides 0."""
+def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, csr_array]:
+    """B_E, by flags of the prescribed components of groups, ``(g, bs)``; and what makes its c.
 
-    row: Array  # place of each among the equality rows, shape (h,)
-    component: Array  # component that it holds, unrolled over the owned groups, shape (h,)
-    factor: Array  # what the component is multiplied by, shape (h,)
-
-
-def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, HeldRows]:
-    """B_E, and which of its rows hold prescribed components, by flags of the groups, ``(g, bs)``.
-
-    A component that is prescribed has one row per copy and no gluing rows. The k − 1 gluing rows of
-    k copies are orthonormal in the inner product of D⁻¹, D the weights of all copies, shape ``(c,
-    bs)``; with equal weights they are (1, …, 1, −j)/√(j + j²), j = 1, …, k − 1. Differences of
-    neighbours instead would have a Gram matrix of condition O(k²).
+    That takes values of all components to right sides, 0 but of rows that hold one. A component
+    that is prescribed has one row per copy and no gluing rows. The k − 1 gluing rows of k copies
+    are orthonormal in the inner product of D⁻¹, D the weights of all copies, shape ``(c, bs)``;
+    with equal weights they are (1, …, 1, −j)/√(j + j²), j = 1, …, k − 1. Differences of neighbours
+    instead would have a Gram matrix of condition O(k²).
     """
     multiplicities = np.unique(dofs.multiplicity)
     tables = [_glue(dofs, flag, weights, int(m)) for m in multiplicities if m > 1]
@@ -66,7 +59,8 @@ def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, He
     place[order] = np.arange(len(order))
     rows = Rows(rows.group[order], place[rows.row], rows.column, rows.value)
     n = len(holding)  # these rows have one entry each, and their entries come first
-    return rows, HeldRows(rows.row[:n], group * dofs.bs + k, rows.value[:n])
+    at = rows.row[:n], group * dofs.bs + k
+    return rows, csr_array((rows.value[:n], at), shape=(len(rows), flag.size))
 
 
 def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
@@ -242,7 +236,8 @@ class Gluing:
     dofs: TornDofs  # dof maps
     prescribed: Prescribed  # Dirichlet values
     records: ContactRecords  # contact conditions of this rank
-    held: HeldRows  # the rows that hold prescribed components
+    # from components of the owned groups, unrolled, to right sides of equality rows, (e, g·bs)
+    to_equalities: csr_array
     contact: ContactRows  # origin of the normal rows
     tangents: TangentRows  # origin of the tangential rows
     constraints: Constraints  # B, c and the sets of rows
@@ -269,8 +264,7 @@ class Gluing:
         along = np.einsum("ntg,ng->nt", records.tangents, held)
         slips = (self.slip - along)[tangents.condition]
         c = np.zeros(self.constraints.num_rows)
-        values = self.prescribed.value.ravel()[self.held.component]
-        c[sets.equalities[self.held.row]] = values * self.held.factor
+        c[sets.equalities] = self.to_equalities @ self.prescribed.value.ravel()
         c[sets.normals] = left[normals.condition] * normals.scale
         c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
         return c
@@ -383,7 +377,7 @@ def glue(
         decided = np.intersect1d(contact.decided, rigid.condition)
         tools.check_nodes(records.contact[decided])
     sliding_rows, tangents = tangent_rows(dofs, builder, contact)
-    equalities, held = equality_rows(dofs, prescribed.flag, D)
+    equalities, to_equalities = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
     constraints = assemble_constraints(
         dofs,
@@ -395,7 +389,9 @@ def glue(
         tools.num_unknowns if tools else 0,
     )
     slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
-    gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)
+    gluing = Gluing(
+        dofs, prescribed, records, to_equalities, contact, tangents, constraints, length, slip
+    )
     try:
         constraints.c[:] = gluing.right_side()
     except TfetiError:  # on all ranks
