@@ -18,12 +18,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.validation import checked_number, checked_type
-from tfeti_dolfinx.constraints.gluing import (
-    Gluing,
-    check_conditions,
-    check_not_on_tears,
-    listed_conditions,
-)
+from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts, gaps_by_position
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
@@ -37,6 +32,7 @@ from tfeti_dolfinx.forms.checks import (
     displacement_space,
     is_axisymmetric,
 )
+from tfeti_dolfinx.forms.dirichlet import check_conditions, listed_conditions
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -135,7 +131,10 @@ class ContactProblem:
             given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
             given |= self._given_besides()
         V = displacement_space(a, decomposition, self.form_name)
-        check_conditions(self.bcs, V)
+        self._seconds = dict(decomposition.seconds)  # of the next solve
+        with stage("constraints", self._seconds):
+            self.dofs = TornDofs(V, decomposition)
+            check_conditions(self.bcs, self.dofs)
         self.u = fem.Function(V, name="displacement") if u is None else checked_function(u, V, "u")
         self._first = np.array(self.u.x.array)
         self._given_stress = stress
@@ -160,15 +159,11 @@ class ContactProblem:
         self._accepted: tuple[Solution | None, Start | None] = (None, None)
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
-        ring = bool(self.contacts) and is_axisymmetric(a, self.form_name, self._thickness)
-        self._seconds = dict(decomposition.seconds)  # of the next solve
+        if self.contacts:
+            self.dofs.axisymmetric = is_axisymmetric(a, self.form_name, self._thickness)
         self.report = Report(seconds=self._seconds)
         with stage("assembly", self._seconds):
             forms = self._forms(a, L, V, form_compiler_options, jit_options)
-        with stage("constraints", self._seconds):
-            self.dofs = TornDofs(V, decomposition)
-            self.dofs.axisymmetric = ring
-            check_not_on_tears(self.bcs, self.dofs)
         forms.thickness = self._thickness
         self._diagnostics = Diagnostics(self.dofs)
         if boundary_elements is not None:
@@ -413,8 +408,7 @@ class ContactProblem:
             given |= {"load": load, "values": conditions, "stiffness": stiffness, "gap": gap}
         V, forms = self.dofs.V, copy(self._system.forms)
         if conditions is not None:
-            check_conditions(conditions, V)
-            check_not_on_tears(conditions, self.dofs)
+            check_conditions(conditions, self.dofs)
         if stiffness is not None:
             check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
             forms.replace_stiffness(stiffness)

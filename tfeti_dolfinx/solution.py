@@ -41,7 +41,6 @@ from tfeti_dolfinx.forms.fields import (
 )
 from tfeti_dolfinx.mortar.facets import (
     diameter,
-    facet_nodes,
     group_points,
     hat_integrals,
     surface_facets,
@@ -382,7 +381,7 @@ class Solution:
     def _groups_on(self, surface: str | int) -> Array:
         """Owned groups of the nodes of a surface, ascending. Collective."""
         member = np.zeros(self.dofs.num_nodes, dtype=bool)
-        member[facet_nodes(self.dofs, surface_facets(self.decomposition, surface))] = True
+        member[self.dofs.facet_nodes(surface_facets(self.decomposition, surface))] = True
         return np.flatnonzero(self.dofs.reduce(member, np.logical_or))
 
     def tool(self, which: int | str = 0) -> ToolState:

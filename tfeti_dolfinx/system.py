@@ -11,7 +11,7 @@ from dolfinx import fem
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank, count_over
-from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
+from tfeti_dolfinx.constraints.gluing import Gluing, glue
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.friction import Coulomb
 from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
@@ -23,6 +23,7 @@ from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.forms.assembly import Data, Forms
+from tfeti_dolfinx.forms.dirichlet import Prescribed, prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts

@@ -19,8 +19,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 class RowTolerances:
     """Tolerances of rows."""
 
-    # values that conditions prescribe at a node differ by less, relative to all
-    agreement: float = 1e-10
     # of a row's norm: if prescribed components leave less, rounding of the normal has made it
     # (ε|x|/h of a facet of size h at x), and the row is dropped
     nothing_left: float = 1e-6

@@ -15,7 +15,7 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import diameter, facet_nodes
+from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 log = logging.getLogger(__name__)
@@ -69,9 +69,7 @@ class ContactSearch:
     def _nodes(self) -> list[list[Array]]:
         """Primal nodes of the surfaces of each contact."""
         dofs, facets = self._dofs, self._dofs.decomposition.facets
-        return [
-            [np.unique(facet_nodes(dofs, facets(s))) for s in c.surfaces] for c in self.contacts
-        ]
+        return [[np.unique(dofs.facet_nodes(facets(s))) for s in c.surfaces] for c in self.contacts]
 
     @property
     def records(self) -> ContactRecords:
