@@ -20,6 +20,7 @@ from tfeti_dolfinx.contact.records import (
     Resultant,
     body_forces,
     condition_areas,
+    held_pressures,
     relative_displacement,
     resultant,
     vertex_tractions,
@@ -441,17 +442,10 @@ class Solution:
         rows, records = self.gluing.contact, self.gluing.records
         force = np.zeros(len(records))
         force[rows.condition] = rows.scale * self.lam[self.gluing.constraints.sets.normals]
-        if not any_rank(self.dofs.comm, len(records.held) > 0):
-            return force
-        pressure = quotient(force, self.area)
-        beside = np.zeros(len(records.held))
-        for contact in range(len(self.contacts)):
-            own, of = records.contact == contact, records.contact[records.held] == contact
-            known = np.zeros(self.dofs.num_groups)
-            known[records.group[own]] = pressure[own]
-            (beside[of],) = self.dofs.lookup(records.beside[of], known)
-        at = self.gluing.closed()
-        force[at] = (sum_rows(records.held, records.share * beside, len(records)) * self.area)[at]
+        if any_rank(self.dofs.comm, len(records.held) > 0):
+            pressure, contacts = quotient(force, self.area), len(self.contacts)
+            borne, at = held_pressures(records, self.dofs, contacts, pressure), self.gluing.closed()
+            force[at] = (borne * self.area)[at]
         return force
 
     @cached_property

@@ -31,9 +31,9 @@ from tfeti_dolfinx.mortar.facets import (
     local_facets,
     surface_facets,
     with_averaged_normals,
-    with_held_vertices,
 )
 from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_curvature
+from tfeti_dolfinx.mortar.multipliers import with_held_vertices
 from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 

@@ -163,21 +163,6 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     )
 
 
-def with_held_vertices(
-    facets: Facets, dofs: TornDofs, normals: Array, flag: Array | None
-) -> Facets:
-    """Return the same facets with flags of vertices that Dirichlet conditions hold. Collective.
-
-    Normals and flags of prescribed components are those of owned groups, shape ``(g, gdim)``; None:
-    nothing is prescribed.
-    """
-    if flag is None:
-        return facets
-    fixed = np.all(flag | (np.abs(normals) <= SEARCH.held), axis=1)
-    (held,) = dofs.lookup(facets.vertices.ravel(), fixed)
-    return replace(facets, held=held.reshape(facets.vertices.shape))
-
-
 def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array]:
     """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
