@@ -11,7 +11,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, notes_of, with_estimates
+from tfeti_dolfinx.accuracy.diagnostics import ESTIMATES, Diagnostics, notes_of, of_estimates
 from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of
 from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
@@ -326,20 +326,21 @@ class ContactProblem:
 
     def _log_warnings(self) -> None:
         """Log warnings on rank 0, each once, whatever figures are in what it says of its bodies."""
-        for text in self.report.warnings:
+        unmet = "contact {} has nothing within reach=, and no constraints".format
+        for text in [*self.report.warnings, *map(unmet, self.report.unmet_contacts)]:
             bodies, _, says = text.partition(": ")
             kind = bodies + re.sub(r"[-+.\d]+(e[-+]?\d+)?", "#", says)
             if kind not in self._logged and self.decomposition.comm.rank == 0:
                 log.warning("%s", text)
             self._logged.add(kind)
-        self._system.search.warn_of(self.report.unmet_contacts)
 
     def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""
         records = self._system.sizes(), self._system.take_counts(), self._counts, self._outcome
         comm = self.decomposition.comm
-        self.report.take(Report.composed(records, self._seconds, self._in_all, comm))
-        self._seconds, self._in_all = {}, self.report.in_all
+        report = Report.composed(records, self._seconds, self._in_all, comm)
+        vars(self.report).update(vars(report))  # a program may hold it over many solves
+        self._seconds, self._in_all = {}, report.in_all
 
     def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
         tools = self._system.tools
@@ -374,7 +375,9 @@ class ContactProblem:
         self._meet("estimate")
         found = estimate(self._system, self.solution, self._rounding)
         known = {name: value for name, value in vars(found).items() if value is not None}
-        self.report.take(with_estimates(self.report, known))
+        self.report.estimates = known
+        kept = [text for text in self.report.warnings if not text.startswith(ESTIMATES)]
+        self.report.warnings = [*kept, *of_estimates(self.report)]
         self._log_warnings()
         return found
 

@@ -295,10 +295,6 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
         return cls(**known, seconds={**seconds, "total": total}, in_all=added(before, own))
 
-    def take(self, other: Report) -> None:
-        """Take all fields of another report: a program may hold this one over many solves."""
-        vars(self).update(vars(other))
-
     def contact(self, which: int | str = 0) -> ContactSummary:
         """Return the entry of a contact, given its name or its position."""
         return self.contacts[position_of([contact.name for contact in self.contacts], which)]

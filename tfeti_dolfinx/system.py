@@ -420,8 +420,6 @@ class System(Generic[OwnForms]):
         )
         if before is None:
             tools.check_begin(contacts, self._search.records)
-        else:
-            self._search.said = before.said
         # its sides stay
         self._secondary = [contact.surfaces[0] for contact in self._search.contacts]
         if self._known_rows is not None:

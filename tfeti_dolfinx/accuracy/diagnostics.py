@@ -1,7 +1,7 @@
 """Diagnostics of a solution: the warnings of the report."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from weakref import ref
 
@@ -20,7 +20,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
 from tfeti_dolfinx.mortar.facets import create_element
 from tfeti_dolfinx.mortar.tolerances import SEARCH
-from tfeti_dolfinx.report import Outcome, Report
+from tfeti_dolfinx.report import Outcome
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock, stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -134,7 +134,7 @@ class Diagnostics:
             *self._facets(solution, dual.subdomains),
             *_drawn(solution),
             *self._lasting,
-            *_of_estimates(outcome),
+            *of_estimates(outcome),
         ]
 
     @cached_property
@@ -321,14 +321,7 @@ def _drawn(solution: Solution) -> Iterator[str]:
         )
 
 
-def with_estimates(report: Report, numbers: dict[str, float]) -> Report:
-    """Return a report with estimates made since, and a warning where they say nothing."""
-    kept = [text for text in report.warnings if not text.startswith(ESTIMATES)]
-    report = replace(report, estimates=numbers)
-    return replace(report, warnings=[*kept, *_of_estimates(report)])
-
-
-def _of_estimates(outcome: Outcome) -> Iterator[str]:
+def of_estimates(outcome: Outcome) -> Iterator[str]:
     """A bound of the algebraic error that no displacement of this size can miss."""
     keys = ("energy", "algebraic", "rounding")
     energy, bound, rounding = (outcome.estimates.get(key, 0.0) for key in keys)

@@ -403,7 +403,7 @@ class ContactDynamics(ContactProblem):
         contact, forces = self.solution.gluing.records.contact, self.solution.condition_forces
         total = summed(self.dofs.comm, sum_rows(contact, forces, len(self.contacts)))
         means = [[float(component) for component in force] for force in total]
-        self.report.take(replace(self.report, motion=motion, contact_forces=means))
+        self.report.motion, self.report.contact_forces = motion, means
 
 
 class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
