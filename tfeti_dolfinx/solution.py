@@ -564,8 +564,8 @@ class Solution:
         decided = gluing.contact.decided
         status[decided[self.force[decided] > 0.0]] = ContactStatus.TOUCHING
         rows = gluing.tangents
-        held = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
-        rubbing = np.where(held, ContactStatus.STICK, ContactStatus.SLIP)
+        sticks = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
+        rubbing = np.where(sticks, ContactStatus.STICK, ContactStatus.SLIP)
         closed = np.isin(rows.condition, np.concatenate((touching, decided)))
         status[rows.condition[closed]] = rubbing[closed]
         status[np.any(self.forced_friction, axis=1)] = ContactStatus.SLIP
