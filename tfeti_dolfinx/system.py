@@ -20,7 +20,7 @@ from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
+from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw, contact_set
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.forms.assembly import Data, Forms
 from tfeti_dolfinx.forms.dirichlet import Prescribed, prescribe
@@ -456,14 +456,17 @@ class System(Generic[OwnForms]):
         self._gluing = gluing.with_right_side(values, records.gap, self._slip())
 
     def _set_friction_limits(self) -> None:
-        """Fill the ψ_i of the rows, and the μ_i under Coulomb's law."""
-        if not self._has_friction:
+        """Fill areas of the rows, the ψ_i, and the μ_i under Coulomb's law."""
+        if not self._has_friction and self._settings.extensions.feasible_set is contact_set:
             return
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
-        constraints, friction = gluing.constraints, made(self.known_friction)
-        constraints.limits[:], constraints.coefficients[:] = gluing.tangents.bounds(friction, area)
+        rows = gluing.constraints
+        rows.area[:] = area[gluing.contact.condition]
+        if self._has_friction:
+            friction = made(self.known_friction)
+            rows.limits[:], rows.coefficients[:] = gluing.tangents.bounds(friction, area)
 
     def _assemble_load(self) -> None:
         self._f = self.elements.load(self.forms)

@@ -123,6 +123,8 @@ class Constraints:
     # the s_i of the conditions with rows, one for each of `sets.normals`: over it what a row misses
     # is a length
     scale: Array
+    # ∫φ_i of the same conditions, times the thickness; 0 without friction, and a set of one's own
+    area: Array
     tangent_scale: Array  # the same for each point of `sets.tangents`, shape (t,)
     # the ψ_i, semi-axes of the sets of the tangential multipliers, shape (t, gdim - 1); 0 until
     # they are set
@@ -247,6 +249,7 @@ def assemble_constraints(
         trace=trace,
         weights=weights[trace],
         scale=scale,
+        area=np.zeros(len(scale)),
         tangent_scale=tangent_scale,
         limits=np.zeros(shape),
         pressed_by=row,
