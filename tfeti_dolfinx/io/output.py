@@ -137,7 +137,13 @@ class SeriesFile:
         self._name, self._comm = name, functions[0].function_space.mesh.comm
         self._functions, self._count, self._kind = list(functions), 0, name.suffix
         self._bytes = _bytes_of(functions) * (3 if self._kind == ".pvd" else 1)  # texts
-        self.partial = begin_file(name, self._comm, is_folder=self._kind != ".bp")
+        self.partial = name.with_name(f".{name.name}.partial")
+        with raised_on_all_ranks(self._comm), named(f"cannot write {name}", OSError):
+            if self._comm.rank == 0:
+                name.parent.mkdir(parents=True, exist_ok=True)
+                _remove(self.partial)  # of an earlier run
+                if self._kind != ".bp":
+                    self.partial.mkdir()
         self._writer: Any = None
         if self._kind == ".bp":
             _reserve(name, self._comm, LITTLE)
@@ -173,22 +179,21 @@ class SeriesFile:
 
     def appear(self) -> list[Path]:
         """Give the files their names, in the place of those of an earlier run."""
-        if self._kind == ".bp":
-            end_file(self.partial, self._name, self._comm)
-            return [self._name]
         self._comm.barrier()
         own = re.compile(re.escape(self._name.stem) + r"(_p\d+_)?\d{6}\.p?vtu")
-        names: list[str] = []
+        names = [self._name.name]
         with raised_on_all_ranks(self._comm), named(f"cannot write {self._name}", OSError):
             if self._comm.rank == 0:
-                names = sorted(file.name for file in self.partial.iterdir())
-                names.sort(key=lambda part: part != self._name.name)
                 _remove(self._name)  # first: it names parts
-                for file in list(self._name.parent.iterdir()):
-                    if self._kind == ".pvd" and own.fullmatch(file.name):
-                        file.unlink()
-                for part in reversed(names):
-                    os.replace(self.partial / part, self._name.with_name(part))
+                if self._kind == ".bp":
+                    os.replace(self.partial, self._name)
+                else:
+                    names += sorted({file.name for file in self.partial.iterdir()} - {*names})
+                    for file in list(self._name.parent.iterdir()):
+                        if self._kind == ".pvd" and own.fullmatch(file.name):
+                            file.unlink()
+                    for part in reversed(names):
+                        os.replace(self.partial / part, self._name.with_name(part))
         _drop(self.partial, self._comm)
         return [self._name.with_name(part) for part in self._comm.bcast(names, root=0)]
 
@@ -365,27 +370,6 @@ def checked_target(
                 whose = " that VTX has not written" if name.suffix == ".bp" else ""
                 raise InputError(f"{name} is a directory{whose}; expected a file")
     return target
-
-
-def begin_file(name: Path, comm: MPI.Intracomm, is_folder: bool = False) -> Path:
-    """Name to write to until the file is whole; what an earlier run left there is removed."""
-    partial = name.with_name(f".{name.name}.partial")
-    with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
-        if comm.rank == 0:
-            name.parent.mkdir(parents=True, exist_ok=True)
-            _remove(partial)
-            if is_folder:
-                partial.mkdir()
-    return partial
-
-
-def end_file(partial: Path, name: Path, comm: MPI.Intracomm) -> None:
-    """Give a whole file its name. Collective."""
-    comm.barrier()
-    with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
-        if comm.rank == 0:
-            _remove(name)
-            os.replace(partial, name)
 
 
 def _reserve(name: Path, comm: MPI.Intracomm, size: int, before: int = 0) -> None:
