@@ -314,14 +314,14 @@ class ContactProblem:
         loose = dual.nearly_free(state.loose) if options.warnings else []
         self._rounding = accuracy.allowed.rounding
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, loose)
-        warnings = list[str]()
+        outcome.solver = f"{options.qp_type} + {options.pc_type}"
         if options.warnings:
             energy, rtol = accuracy.measures.energies, options.number
-            warnings = self._diagnostics.found(dual, solution, outcome, energy, rtol)
-        method, notes = f"{options.qp_type} + {options.pc_type}", notes_of(outcome, solution)
-        self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
+            outcome.warnings = self._diagnostics.found(dual, solution, outcome, energy, rtol)
+        outcome.notes, self._outcome = notes_of(outcome, solution), outcome
         body = [*d.body_names, *system.tools.free_names][settling.body]
-        conclude(result, accuracy, now, d.comm, excluding, body, settling.slides, warnings + notes)
+        said = outcome.warnings + outcome.notes
+        conclude(result, accuracy, now, d.comm, excluding, body, settling.slides, said)
         return solution, accuracy.allowed.overlap
 
     def _log_warnings(self) -> None:

@@ -191,11 +191,8 @@ class Diagnostics:
         terms, moved = subdomains.of_bodies(squares)
         # that of a body which only moves is rounding
         known = energy > EPSILON * np.maximum(energy, EPSILON * moved).max(initial=0.0)
-        share = (
-            LIMITS.rounding
-            * EPSILON
-            * np.divide(terms, energy, out=np.zeros_like(terms), where=known)
-        )
+        share = np.divide(terms, energy, out=np.zeros_like(terms), where=known)
+        share *= LIMITS.rounding * EPSILON
         if np.any(share > rtol):
             yield (
                 f"{self._names(share > rtol)}: rounding of the stiffness may change the "
@@ -258,15 +255,11 @@ class Diagnostics:
         diagonal = joined([block.diagonal for block in subdomains.elastic])
         K = self._dofs.reduce(diagonal.reshape(-1, self._dofs.bs).mean(axis=1), np.add)
         (K,) = self._dofs.lookup(records.entry_group, K)
-        gives = records.area * sum_rows(records.condition, records.weight**2 / K, len(records))
+        gives = solution.area * sum_rows(records.condition, records.weight**2 / K, len(records))
         change = records.curved_gap - records.geometric_gap
         overlap = -change - np.maximum(solution.remaining_gap, 0.0)
         change = np.where(solution.force > 0.0, np.abs(change), overlap)
-        believed = records.covered >= SEARCH.believed
-        pressure = np.where(believed, solution.force, 0.0) / records.area
-        peaks = np.zeros(len(solution.contacts))
-        np.maximum.at(peaks, records.contact, pressure)
-        comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
+        peaks, _ = solution.largest_pressures
         for i, contact in enumerate(solution.contacts):
             own = shown & (records.contact == i)
             own &= change > np.maximum(LIMITS.facets * peaks[i] * gives, 0.0)
