@@ -180,22 +180,22 @@ class SeriesFile:
     def appear(self) -> list[Path]:
         """Give the files their names, in the place of those of an earlier run."""
         self._comm.barrier()
-        own = re.compile(re.escape(self._name.stem) + r"(_p\d+_)?\d{6}\.p?vtu")
-        names = [self._name.name]
+        names, parent = [self._name.name], self._name.parent
         with raised_on_all_ranks(self._comm), named(f"cannot write {self._name}", OSError):
             if self._comm.rank == 0:
                 _remove(self._name)  # first: it names parts
                 if self._kind == ".bp":
                     os.replace(self.partial, self._name)
-                else:
+                if self._kind == ".pvd":
+                    own = re.compile(re.escape(self._name.stem) + r"(_p\d+_)?\d{6}\.p?vtu")
+                    for file in [file for file in parent.iterdir() if own.fullmatch(file.name)]:
+                        file.unlink()
+                if self._kind != ".bp":
                     names += sorted({file.name for file in self.partial.iterdir()} - {*names})
-                    for file in list(self._name.parent.iterdir()):
-                        if self._kind == ".pvd" and own.fullmatch(file.name):
-                            file.unlink()
                     for part in reversed(names):
-                        os.replace(self.partial / part, self._name.with_name(part))
+                        os.replace(self.partial / part, parent / part)
         _drop(self.partial, self._comm)
-        return [self._name.with_name(part) for part in self._comm.bcast(names, root=0)]
+        return [parent / part for part in self._comm.bcast(names, root=0)]
 
 
 class Series:
