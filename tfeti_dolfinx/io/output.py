@@ -145,14 +145,19 @@ class SeriesFile:
                 if self._kind != ".bp":
                     self.partial.mkdir()
         self._writer: Any = None
-        if self._kind == ".bp":
-            _reserve(name, self._comm, LITTLE)
-        with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
-            if self._kind == ".bp":
-                self._writer = io.VTXWriter(self._comm, self.partial, self._functions, engine="BP4")
-            else:
-                kind = io.VTKFile if self._kind == ".pvd" else io.XDMFFile
-                self._writer = kind(self._comm, self.partial / name.name, "w")
+        try:
+            if self._kind != ".pvd":  # which is begun without a byte
+                _reserve(name, self._comm, LITTLE)
+            with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
+                if self._kind == ".bp":
+                    functions = self._functions
+                    self._writer = io.VTXWriter(self._comm, self.partial, functions, engine="BP4")
+                else:
+                    kind = io.VTKFile if self._kind == ".pvd" else io.XDMFFile
+                    self._writer = kind(self._comm, self.partial / name.name, "w")
+        except TfetiError:  # on all ranks
+            _drop(self.partial, self._comm)
+            raise
 
     def write(self, time: float) -> None:
         """Add what the functions and the mesh have; times before this one are whole."""
