@@ -11,7 +11,6 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, largest
-from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus, ToolState
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -26,6 +25,7 @@ from tfeti_dolfinx.contact.records import (
     vertex_tractions,
 )
 from tfeti_dolfinx.contact.rigid_body import rotation_vector
+from tfeti_dolfinx.contact.state import ContactData, ContactStatus, ToolState
 from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin
