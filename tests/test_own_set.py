@@ -89,16 +89,16 @@ def test_a_set_that_changes_is_asked_for_before_each_solve():
 
 
 def test_glue_alone_holds_a_block_up_to_its_limit():
-    """16 nodes, and a load of 0.05: what a set bears is seen before a multiplication."""
-    limit = [1e-3]
+    """By a strength on an area of 1, and a load of 0.05: that is seen before a multiplication."""
+    limit = [0.04]
     own = Extensions(
-        feasible_set=lambda B: Product([(B.sets.normals, Bounds(-limit[0] / B.scale))])
+        feasible_set=lambda B: Product([(B.sets.normals, Bounds(-limit[0] * B.area / B.scale))])
     )
     ceiling = Obstacle("top", Plane((0, 0, 1), (0, 0, -1)))
     d = decomposed("hexahedron", 3, 4)
     p = problem(d, (0, 0, -0.05), [ceiling], clamped=(), loaded="bottom", extensions=own)
     with pytest.raises(NoSolutionError, match="feasible_set has no forces that balance the load"):
         p.solve()
-    limit[0] = 0.05
+    limit[0] = 0.06
     p.solve()
     assert p.solution.contact(0).resultant.force == pytest.approx([0, 0, 0.05], abs=1e-7)

@@ -7,9 +7,10 @@ from mpi4py import MPI
 from scenes import clamp, decomposed, roller
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.constraints.gluing import glue, prescribe
+from tfeti_dolfinx.constraints.gluing import glue
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.errors import InputError, NoSolutionError
+from tfeti_dolfinx.forms.dirichlet import prescribe
 
 PAIR = sided("upper bottom", "lower top", reach=0.5)
 

@@ -7,9 +7,10 @@ from mpi4py import MPI
 from scenes import by_point, curved_obstacle, decomposed, roller
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.constraints.gluing import glue, prescribe
+from tfeti_dolfinx.constraints.gluing import glue
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.records import slips
+from tfeti_dolfinx.forms.dirichlet import prescribe
 from tfeti_dolfinx.mortar.facets import group_points
 
 TRESCA, COULOMB = tfeti.Tresca(0.1), tfeti.Coulomb(0.3)
@@ -116,8 +117,7 @@ def test_prescribed_values_slip():
 
     def motion(x):
         u = np.sin(3.0 * x)
-        lower = d_lower(x)
-        u[lower, 0] = 0.125
+        u[d_lower(x), 0] = 0.125
         return u
 
     def d_lower(x):  # nodes of both boxes lie on z = 0: the lower box has other x there

@@ -30,11 +30,11 @@ Example:
 
 from typing import TYPE_CHECKING, Any
 
-from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.partner import Contact, Obstacle
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
+from tfeti_dolfinx.contact.state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh, read_surface
 from tfeti_dolfinx.errors import (
     ConvergenceError,

@@ -11,20 +11,14 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, notes_of, with_estimates
+from tfeti_dolfinx.accuracy.diagnostics import ESTIMATES, Diagnostics, notes_of, of_estimates
 from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of
 from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.validation import checked_number, checked_type
-from tfeti_dolfinx.constraints.contact_state import Multipliers
-from tfeti_dolfinx.constraints.gluing import (
-    Gluing,
-    check_conditions,
-    check_not_on_tears,
-    listed_conditions,
-)
+from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts, gaps_by_position
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
@@ -38,6 +32,7 @@ from tfeti_dolfinx.forms.checks import (
     displacement_space,
     is_axisymmetric,
 )
+from tfeti_dolfinx.forms.dirichlet import check_conditions, listed_conditions
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -136,7 +131,10 @@ class ContactProblem:
             given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
             given |= self._given_besides()
         V = displacement_space(a, decomposition, self.form_name)
-        check_conditions(self.bcs, V)
+        self._seconds = dict(decomposition.seconds)  # of the next solve
+        with stage("constraints", self._seconds):
+            self.dofs = TornDofs(V, decomposition)
+            check_conditions(self.bcs, self.dofs)
         self.u = fem.Function(V, name="displacement") if u is None else checked_function(u, V, "u")
         self._first = np.array(self.u.x.array)
         self._given_stress = stress
@@ -161,15 +159,11 @@ class ContactProblem:
         self._accepted: tuple[Solution | None, Start | None] = (None, None)
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
-        ring = bool(self.contacts) and is_axisymmetric(a, self.form_name, self._thickness)
-        self._seconds = dict(decomposition.seconds)  # of the next solve
+        if self.contacts:
+            self.dofs.axisymmetric = is_axisymmetric(a, self.form_name, self._thickness)
         self.report = Report(seconds=self._seconds)
         with stage("assembly", self._seconds):
             forms = self._forms(a, L, V, form_compiler_options, jit_options)
-        with stage("constraints", self._seconds):
-            self.dofs = TornDofs(V, decomposition)
-            self.dofs.axisymmetric = ring
-            check_not_on_tears(self.bcs, self.dofs)
         forms.thickness = self._thickness
         self._diagnostics = Diagnostics(self.dofs)
         if boundary_elements is not None:
@@ -305,10 +299,9 @@ class ContactProblem:
                 lam[let_go(dual.coarse, state)] = 0.0
         # 2. their displacement
         with stage("recovery", seconds):
-            multipliers = Multipliers(lam, result.face)
             nodal = dual.subdomains.num_nodal
             system.tools.take(accuracy.u[nodal:])
-            solution = self._make_solution(accuracy.u[:nodal], multipliers, gluing)
+            solution = self._make_solution(accuracy.u[:nodal], lam, result.face, gluing)
             self._solution = solution
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         end = gluing, lam, result.mu, system.inverses
@@ -321,41 +314,43 @@ class ContactProblem:
         loose = dual.nearly_free(state.loose) if options.warnings else []
         self._rounding = accuracy.allowed.rounding
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, loose)
-        warnings = list[str]()
+        outcome.solver = f"{options.qp_type} + {options.pc_type}"
         if options.warnings:
             energy, rtol = accuracy.measures.energies, options.number
-            warnings = self._diagnostics.found(dual, solution, outcome, energy, rtol)
-        method, notes = f"{options.qp_type} + {options.pc_type}", notes_of(outcome, solution)
-        self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
+            outcome.warnings = self._diagnostics.found(dual, solution, outcome, energy, rtol)
+        outcome.notes, self._outcome = notes_of(outcome, solution), outcome
         body = [*d.body_names, *system.tools.free_names][settling.body]
-        conclude(result, accuracy, now, d.comm, excluding, body, settling.slides, warnings + notes)
+        said = outcome.warnings + outcome.notes
+        conclude(result, accuracy, now, d.comm, excluding, body, settling.slides, said)
         return solution, accuracy.allowed.overlap
 
     def _log_warnings(self) -> None:
         """Log warnings on rank 0, each once, whatever figures are in what it says of its bodies."""
-        for text in self.report.warnings:
+        unmet = "contact {} has nothing within reach=, and no constraints".format
+        for text in [*self.report.warnings, *map(unmet, self.report.unmet_contacts)]:
             bodies, _, says = text.partition(": ")
             kind = bodies + re.sub(r"[-+.\d]+(e[-+]?\d+)?", "#", says)
             if kind not in self._logged and self.decomposition.comm.rank == 0:
                 log.warning("%s", text)
             self._logged.add(kind)
-        self._system.search.warn_of(self.report.unmet_contacts)
 
     def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""
         records = self._system.sizes(), self._system.take_counts(), self._counts, self._outcome
         comm = self.decomposition.comm
-        self.report.take(Report.composed(records, self._seconds, self._in_all, comm))
-        self._seconds, self._in_all = {}, self.report.in_all
+        report = Report.composed(records, self._seconds, self._in_all, comm)
+        vars(self.report).update(vars(report))  # a program may hold it over many solves
+        self._seconds, self._in_all = {}, report.in_all
 
-    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+    def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
         tools = self._system.tools
         if tools:
             motion = tools.motion(gluing.records, found=True)
             gluing = replace(gluing, records=replace(gluing.records, motion=motion))
         solution = Solution(
             u=u,
-            multipliers=multipliers,
+            lam=lam,
+            face=face,
             gluing=gluing,
             contacts=list(self._system.search.contacts),
             stress=None if self._stress is None else self._stress.frozen(),
@@ -380,7 +375,9 @@ class ContactProblem:
         self._meet("estimate")
         found = estimate(self._system, self.solution, self._rounding)
         known = {name: value for name, value in vars(found).items() if value is not None}
-        self.report.take(with_estimates(self.report, known))
+        self.report.estimates = known
+        kept = [text for text in self.report.warnings if not text.startswith(ESTIMATES)]
+        self.report.warnings = [*kept, *of_estimates(self.report)]
         self._log_warnings()
         return found
 
@@ -414,8 +411,7 @@ class ContactProblem:
             given |= {"load": load, "values": conditions, "stiffness": stiffness, "gap": gap}
         V, forms = self.dofs.V, copy(self._system.forms)
         if conditions is not None:
-            check_conditions(conditions, V)
-            check_not_on_tears(conditions, self.dofs)
+            check_conditions(conditions, self.dofs)
         if stiffness is not None:
             check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
             forms.replace_stiffness(stiffness)
@@ -549,7 +545,7 @@ class ContactProblem:
         dual.last.take(self.dofs.comm, state.lam, state.image)
         # a face that only knows what rows do
         face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
-        solution = self._make_solution(state.u, Multipliers(state.lam, face), gluing)
+        solution = self._make_solution(state.u, state.lam, face, gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
         system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))

@@ -18,9 +18,9 @@ from tfeti_dolfinx.common.arrays import quotient, sum_rows
 from tfeti_dolfinx.common.files import written_whole
 from tfeti_dolfinx.common.parallel import largest, summed
 from tfeti_dolfinx.common.validation import named
-from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import position_of
+from tfeti_dolfinx.contact.state import ContactStatus
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy
@@ -294,10 +294,6 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         total = sum(seconds.values())
         own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
         return cls(**known, seconds={**seconds, "total": total}, in_all=added(before, own))
-
-    def take(self, other: Report) -> None:
-        """Take all fields of another report: a program may hold this one over many solves."""
-        vars(self).update(vars(other))
 
     def contact(self, which: int | str = 0) -> ContactSummary:
         """Return the entry of a contact, given its name or its position."""

@@ -176,7 +176,7 @@ class SavedState:
         gluing, holding = solution.gluing, solution.holding
         records, dofs = gluing.records, solution.dofs
         tag_of = solution.decomposition.surface
-        held = np.where(holding, Status.STICK, Status.SLIP)
+        bearing = np.where(holding, Status.STICK, Status.SLIP)
         nodes = labels_of_nodes(dofs)
         of_groups = labels_of_groups(dofs, nodes)
         return cls(
@@ -188,7 +188,7 @@ class SavedState:
             lam=solution.lam,
             mu=mu,
             norm=np.array(norm),
-            status=np.where(solution.carrying, held, Status.OPEN),
+            status=np.where(solution.carrying, bearing, Status.OPEN),
             slip=gluing.slip,
             reach=np.array(reach, dtype=float),
             secondary=np.array([tag_of(c.surfaces[0]) for c in solution.contacts], dtype=np.int64),

@@ -11,12 +11,6 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, largest
-from tfeti_dolfinx.constraints.contact_state import (
-    ContactData,
-    ContactStatus,
-    Multipliers,
-    ToolState,
-)
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -25,11 +19,13 @@ from tfeti_dolfinx.contact.records import (
     Resultant,
     body_forces,
     condition_areas,
+    held_pressures,
     relative_displacement,
     resultant,
     vertex_tractions,
 )
 from tfeti_dolfinx.contact.rigid_body import rotation_vector
+from tfeti_dolfinx.contact.state import ContactData, ContactStatus, ToolState
 from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin
@@ -46,12 +42,12 @@ from tfeti_dolfinx.forms.fields import (
 )
 from tfeti_dolfinx.mortar.facets import (
     diameter,
-    facet_nodes,
     group_points,
     hat_integrals,
     surface_facets,
 )
 from tfeti_dolfinx.mortar.tolerances import SEARCH
+from tfeti_dolfinx.qp.sets import Face
 
 # of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
@@ -86,14 +82,15 @@ class Solution:
     def __init__(
         self,
         u: Array,
-        multipliers: Multipliers,
+        lam: Array,
+        face: Face,
         gluing: Gluing,
         contacts: Sequence[ContactPartner] = (),
         stress: Stress | None = None,
         thickness: Any = 1.0,
     ) -> None:
-        self.u, self.lam = u, multipliers.lam
-        self.carrying, self.holding = multipliers.face.carrying, multipliers.face.holding
+        self.u, self.lam = u, lam
+        self.carrying, self.holding = face.carrying, face.holding
         self.gluing, self.dofs, self.decomposition = gluing, gluing.dofs, gluing.dofs.decomposition
         self.contacts, self.thickness = list(contacts), frozen(thickness)
         self.tool_motions: Sequence[ToolMotion] = ()
@@ -385,7 +382,7 @@ class Solution:
     def _groups_on(self, surface: str | int) -> Array:
         """Owned groups of the nodes of a surface, ascending. Collective."""
         member = np.zeros(self.dofs.num_nodes, dtype=bool)
-        member[facet_nodes(self.dofs, surface_facets(self.decomposition, surface))] = True
+        member[self.dofs.facet_nodes(surface_facets(self.decomposition, surface))] = True
         return np.flatnonzero(self.dofs.reduce(member, np.logical_or))
 
     def tool(self, which: int | str = 0) -> ToolState:
@@ -445,17 +442,10 @@ class Solution:
         rows, records = self.gluing.contact, self.gluing.records
         force = np.zeros(len(records))
         force[rows.condition] = rows.scale * self.lam[self.gluing.constraints.sets.normals]
-        if not any_rank(self.dofs.comm, len(records.held) > 0):
-            return force
-        pressure = quotient(force, self.area)
-        beside = np.zeros(len(records.held))
-        for contact in range(len(self.contacts)):
-            own, of = records.contact == contact, records.contact[records.held] == contact
-            known = np.zeros(self.dofs.num_groups)
-            known[records.group[own]] = pressure[own]
-            (beside[of],) = self.dofs.lookup(records.beside[of], known)
-        at = self.gluing.closed()
-        force[at] = (sum_rows(records.held, records.share * beside, len(records)) * self.area)[at]
+        if any_rank(self.dofs.comm, len(records.held) > 0):
+            pressure, contacts = quotient(force, self.area), len(self.contacts)
+            borne, at = held_pressures(records, self.dofs, contacts, pressure), self.gluing.closed()
+            force[at] = (borne * self.area)[at]
         return force
 
     @cached_property
@@ -574,8 +564,8 @@ class Solution:
         decided = gluing.contact.decided
         status[decided[self.force[decided] > 0.0]] = ContactStatus.TOUCHING
         rows = gluing.tangents
-        held = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
-        rubbing = np.where(held, ContactStatus.STICK, ContactStatus.SLIP)
+        sticks = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
+        rubbing = np.where(sticks, ContactStatus.STICK, ContactStatus.SLIP)
         closed = np.isin(rows.condition, np.concatenate((touching, decided)))
         status[rows.condition[closed]] = rubbing[closed]
         status[np.any(self.forced_friction, axis=1)] = ContactStatus.SLIP

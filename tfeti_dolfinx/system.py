@@ -11,7 +11,7 @@ from dolfinx import fem
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank, count_over
-from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
+from tfeti_dolfinx.constraints.gluing import Gluing, glue
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.friction import Coulomb
 from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
@@ -20,9 +20,10 @@ from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
+from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw, contact_set
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.forms.assembly import Data, Forms
+from tfeti_dolfinx.forms.dirichlet import Prescribed, prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
@@ -419,8 +420,6 @@ class System(Generic[OwnForms]):
         )
         if before is None:
             tools.check_begin(contacts, self._search.records)
-        else:
-            self._search.said = before.said
         # its sides stay
         self._secondary = [contact.surfaces[0] for contact in self._search.contacts]
         if self._known_rows is not None:
@@ -460,14 +459,17 @@ class System(Generic[OwnForms]):
             self.change("friction")
 
     def _set_friction_limits(self) -> None:
-        """Fill the ψ_i of the rows, and the μ_i under Coulomb's law."""
-        if not self._has_friction:
+        """Fill areas of the rows, the ψ_i, and the μ_i under Coulomb's law."""
+        if not self._has_friction and self._settings.extensions.feasible_set is contact_set:
             return
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
-        constraints, friction = gluing.constraints, made(self.known_friction)
-        constraints.limits[:], constraints.coefficients[:] = gluing.tangents.bounds(friction, area)
+        rows = gluing.constraints
+        rows.area[:] = area[gluing.contact.condition]
+        if self._has_friction:
+            friction = made(self.known_friction)
+            rows.limits[:], rows.coefficients[:] = gluing.tangents.bounds(friction, area)
 
     def _assemble_load(self) -> None:
         self._f = self.elements.load(self.forms)

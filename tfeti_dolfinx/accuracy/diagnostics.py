@@ -1,7 +1,7 @@
 """Diagnostics of a solution: the warnings of the report."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from weakref import ref
 
@@ -20,7 +20,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
 from tfeti_dolfinx.mortar.facets import create_element
 from tfeti_dolfinx.mortar.tolerances import SEARCH
-from tfeti_dolfinx.report import Outcome, Report
+from tfeti_dolfinx.report import Outcome
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock, stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -131,7 +131,7 @@ class Diagnostics:
             *self._turned(u, dual.subdomains),
             *self._facets(solution, dual.subdomains),
             *self._lasting,
-            *_of_estimates(outcome),
+            *of_estimates(outcome),
         ]
 
     @cached_property
@@ -188,11 +188,8 @@ class Diagnostics:
         terms, moved = subdomains.of_bodies(squares)
         # that of a body which only moves is rounding
         known = energy > EPSILON * np.maximum(energy, EPSILON * moved).max(initial=0.0)
-        share = (
-            LIMITS.rounding
-            * EPSILON
-            * np.divide(terms, energy, out=np.zeros_like(terms), where=known)
-        )
+        share = np.divide(terms, energy, out=np.zeros_like(terms), where=known)
+        share *= LIMITS.rounding * EPSILON
         if np.any(share > rtol):
             yield (
                 f"{self._names(share > rtol)}: rounding of the stiffness may change the "
@@ -255,15 +252,11 @@ class Diagnostics:
         diagonal = joined([block.diagonal for block in subdomains.elastic])
         K = self._dofs.reduce(diagonal.reshape(-1, self._dofs.bs).mean(axis=1), np.add)
         (K,) = self._dofs.lookup(records.entry_group, K)
-        gives = records.area * sum_rows(records.condition, records.weight**2 / K, len(records))
+        gives = solution.area * sum_rows(records.condition, records.weight**2 / K, len(records))
         change = records.curved_gap - records.geometric_gap
         overlap = -change - np.maximum(solution.remaining_gap, 0.0)
         change = np.where(solution.force > 0.0, np.abs(change), overlap)
-        believed = records.covered >= SEARCH.believed
-        pressure = np.where(believed, solution.force, 0.0) / records.area
-        peaks = np.zeros(len(solution.contacts))
-        np.maximum.at(peaks, records.contact, pressure)
-        comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
+        peaks, _ = solution.largest_pressures
         for i, contact in enumerate(solution.contacts):
             own = shown & (records.contact == i)
             own &= change > np.maximum(LIMITS.facets * peaks[i] * gives, 0.0)
@@ -294,14 +287,7 @@ class Diagnostics:
         return f"{listed} and {rest} more" if rest > 0 else listed
 
 
-def with_estimates(report: Report, numbers: dict[str, float]) -> Report:
-    """Return a report with estimates made since, and a warning where they say nothing."""
-    kept = [text for text in report.warnings if not text.startswith(ESTIMATES)]
-    report = replace(report, estimates=numbers)
-    return replace(report, warnings=[*kept, *_of_estimates(report)])
-
-
-def _of_estimates(outcome: Outcome) -> Iterator[str]:
+def of_estimates(outcome: Outcome) -> Iterator[str]:
     """A bound of the algebraic error that no displacement of this size can miss."""
     keys = ("energy", "algebraic", "rounding")
     energy, bound, rounding = (outcome.estimates.get(key, 0.0) for key in keys)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from dolfinx import fem
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import space_of
 from tfeti_dolfinx.common.parallel import any_rank, count_over, largest, least
-from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.constraints.contact_rows import (
     ContactRows,
     RowBuilder,
@@ -30,29 +27,21 @@ from tfeti_dolfinx.constraints.rows import (
 )
 from tfeti_dolfinx.contact.records import ContactRecords, Friction, relative_motion
 from tfeti_dolfinx.contact.tools import Tools
-from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
-from tfeti_dolfinx.mortar.facets import facet_nodes
+from tfeti_dolfinx.errors import NoSolutionError, TfetiError
+from tfeti_dolfinx.forms.dirichlet import Prescribed
+from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # --- Rows of interfaces and Dirichlet conditions ----------------------------------------------
 
 
-@dataclass(frozen=True)
-class HeldRows:
-    """The equality rows that hold prescribed components; the others have right sides 0."""
+def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, csr_array]:
+    """B_E, by flags of the prescribed components of groups, ``(g, bs)``; and what makes its c.
 
-    row: Array  # place of each among the equality rows, shape (h,)
-    component: Array  # component that it holds, unrolled over the owned groups, shape (h,)
-    factor: Array  # what the component is multiplied by, shape (h,)
-
-
-def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, HeldRows]:
-    """B_E, and which of its rows hold prescribed components, by flags of the groups, ``(g, bs)``.
-
-    A component that is prescribed has one row per copy and no gluing rows. The k − 1 gluing rows of
-    k copies are orthonormal in the inner product of D⁻¹, D the weights of all copies, shape ``(c,
-    bs)``; with equal weights they are (1, …, 1, −j)/√(j + j²), j = 1, …, k − 1. Differences of
-    neighbours instead would have a Gram matrix of condition O(k²).
+    That takes values of all components to right sides, 0 but of rows that hold one. A component
+    that is prescribed has one row per copy and no gluing rows. The k − 1 gluing rows of k copies
+    are orthonormal in the inner product of D⁻¹, D the weights of all copies, shape ``(c, bs)``;
+    with equal weights they are (1, …, 1, −j)/√(j + j²), j = 1, …, k − 1. Differences of neighbours
+    instead would have a Gram matrix of condition O(k²).
     """
     multiplicities = np.unique(dofs.multiplicity)
     tables = [_glue(dofs, flag, weights, int(m)) for m in multiplicities if m > 1]
@@ -67,7 +56,8 @@ def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, He
     place[order] = np.arange(len(order))
     rows = Rows(rows.group[order], place[rows.row], rows.column, rows.value)
     n = len(holding)  # these rows have one entry each, and their entries come first
-    return rows, HeldRows(rows.row[:n], group * dofs.bs + k, rows.value[:n])
+    at = rows.row[:n], group * dofs.bs + k
+    return rows, csr_array((rows.value[:n], at), shape=(len(rows), flag.size))
 
 
 def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
@@ -92,143 +82,6 @@ def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
     )
 
 
-# --- Dirichlet values on torn copies ----------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Prescribed:
-    """Components that Dirichlet conditions prescribe, for the owned groups."""
-
-    flag: Array  # whether a component is prescribed, shape (g, bs)
-    value: Array  # its value, 0 where it is not, shape (g, bs)
-
-
-def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
-    """Collect Dirichlet values and spread them to all copies of their nodes. Collective."""
-    size = dofs.V.dofmap.index_map.size_local * dofs.bs
-    values = np.full((len(bcs), size), np.nan)
-    for row, bc in zip(values, bcs, strict=True):
-        bc.set(row)
-    low = np.fmin.reduce(values, axis=0, initial=np.inf)
-    high = np.fmax.reduce(values, axis=0, initial=-np.inf)
-    low = dofs.reduce(dofs.to_primal(low).reshape(-1, dofs.bs), np.minimum)
-    high = dofs.reduce(dofs.to_primal(high).reshape(-1, dofs.bs), np.maximum)
-    flag = low <= high
-    with raised_on_all_ranks(dofs.comm):
-        for number, bc in enumerate(bcs):
-            value = bc.g.x.array if hasattr(bc.g, "x") else bc.g.value
-            if not np.all(np.isfinite(value)):
-                raise InputError(f"Dirichlet condition {number} has a value that is not finite")
-        scale = np.abs(np.concatenate((low[flag], high[flag]))).max(initial=0.0)
-        apart = np.subtract(high, low, out=np.zeros_like(low), where=flag)
-        if np.any(wrong := apart > TOLERANCES.agreement * scale):
-            at = tuple(np.argwhere(wrong)[0])
-            raise InputError(
-                f"Dirichlet conditions contradict each other: component {at[1]} of a node is "
-                f"prescribed as {low[at]} and as {high[at]} "
-                f"(at {wrong.sum()} components of nodes on this rank)"
-            )
-    return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
-
-
-def check_conditions(conditions: Sequence[fem.DirichletBC], V: fem.FunctionSpace) -> None:
-    """Raise unless conditions are on V or a component of V, with unknowns of it. Collective."""
-    count = np.zeros(len(conditions), dtype=np.int64)
-    with raised_on_all_ranks(V.mesh.comm):
-        for number, bc in enumerate(conditions):
-            _check_space(f"Dirichlet condition {number}", bc, V)
-            count[number] = len(bc.dof_indices()[0])
-    total = V.mesh.comm.allreduce(count)
-    if not np.all(total):
-        raise InputError(
-            f"Dirichlet condition {int(np.argmin(total))} holds nowhere: it has no unknowns on any "
-            "rank; expected at least one"
-        )
-
-
-def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
-    """Raise if a condition prescribes facets of tears as if they were of the boundary. Collective.
-
-    To DOLFINx tears are exterior facets, too; a condition knows unknowns only. It is wrong if each
-    of its unknowns is on an exterior facet that it prescribes wholly, in a component, some of the
-    boundary, some of tears with nodes off it. So a region with nodes inside of subdomains may be
-    prescribed, and a surface inside a body in a condition of its own.
-    """
-    decomposition = dofs.decomposition
-    if not bcs or not decomposition.is_torn:
-        return
-    tears, outer = (facet_nodes(dofs, f) for f in (decomposition.tears, decomposition.boundary))
-    at_boundary = np.zeros(dofs.num_nodes, dtype=bool)
-    at_boundary[outer] = True
-    at_boundary = dofs.spread(dofs.reduce(at_boundary, np.logical_or))
-    within = ~np.all(at_boundary[tears], axis=1)
-    count = np.empty((len(bcs), 3, dofs.bs), dtype=np.int64)
-    for number, bc in enumerate(bcs):
-        held = np.zeros(dofs.num_nodes * dofs.bs, dtype=bool)
-        held[bc.dof_indices()[0]] = True
-        held = dofs.to_primal(held).reshape(-1, dofs.bs)
-        of_tears, of_outer = (np.all(held[nodes], axis=1) for nodes in (tears, outer))
-        count[number, 0] = np.sum(of_tears[within], axis=0)
-        count[number, 1] = np.sum(of_outer, axis=0)
-        for nodes, whole in ((tears, of_tears), (outer, of_outer)):
-            facet, component = np.nonzero(whole)
-            held[nodes[facet], component[:, None]] = False
-        count[number, 2] = np.sum(held, axis=0)
-    tear, boundary, others = np.moveaxis(dofs.comm.allreduce(count), 1, 0)
-    wrong = np.max(np.where((boundary > 0) & (others == 0), tear, 0), axis=1)
-    if np.any(wrong):
-        number = int(np.argmax(wrong > 0))
-        raise InputError(
-            f"Dirichlet condition {number} prescribes {(wrong[number] + 1) // 2} facets that lie "
-            "on tears inside a body, besides facets of its boundary: to DOLFINx tears are "
-            "exterior, too; expected facets of the boundary: decomposition.boundary, "
-            "decomposition.facets(name) or decomposition.locate_facets(marker); a surface inside a "
-            "body, and nodes of a region that are not on the boundary, are for a condition of "
-            "their own"
-        )
-
-
-def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
-    """Return the conditions as a list; raise an InputError for anything else. Not collective."""
-    if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
-        raise InputError(
-            f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
-        )
-    conditions = list(bcs)
-    for number, bc in enumerate(conditions):
-        what = f"Dirichlet condition {number}"
-        checked_type(bc, fem.DirichletBC, what, "a dolfinx.fem.DirichletBC")
-    return conditions
-
-
-def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
-    space = space_of(bc)
-    if space.mesh is not V.mesh._cpp_object:
-        raise InputError(
-            f"{what} is on another mesh; expected a space on decomposition.mesh, the torn mesh"
-        )
-    if hasattr(bc.g, "x") and bc.g.function_space.mesh is not space.mesh:
-        raise InputError(
-            f"the value of {what} is a function on another mesh; expected one on "
-            "decomposition.mesh, the torn mesh, such as decomposition.from_original(g)"
-        )
-    own, component = V._cpp_object, list(space.component())
-    if len(component) == 1 and 0 <= component[0] < V.num_sub_spaces:
-        own = own.sub(component)
-    if not is_same_space(space, own):
-        raise InputError(
-            f"{what} is on {described(space)}; expected the space of a, "
-            f"{described(V._cpp_object)}, or V.sub(i) of it"
-        )
-    size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
-    highest = int(bc.dof_indices()[0].max(initial=-1))
-    if highest >= size:
-        raise InputError(
-            f"{what} prescribes the unknown {highest}, but this rank has {size}; expected "
-            "unknowns that were located in the space of a"
-        )
-
-
 # --- All rows of a scene ----------------------------------------------------------------------
 
 
@@ -243,7 +96,8 @@ class Gluing:
     dofs: TornDofs  # dof maps
     prescribed: Prescribed  # Dirichlet values
     records: ContactRecords  # contact conditions of this rank
-    held: HeldRows  # the rows that hold prescribed components
+    # from components of the owned groups, unrolled, to right sides of equality rows, (e, g·bs)
+    to_equalities: csr_array
     contact: ContactRows  # origin of the normal rows
     tangents: TangentRows  # origin of the tangential rows
     constraints: Constraints  # B, c and the sets of rows
@@ -270,8 +124,7 @@ class Gluing:
         along = np.einsum("ntg,ng->nt", records.tangents, held)
         slips = (self.slip - along)[tangents.condition]
         c = np.zeros(self.constraints.num_rows)
-        values = self.prescribed.value.ravel()[self.held.component]
-        c[sets.equalities[self.held.row]] = values * self.held.factor
+        c[sets.equalities] = self.to_equalities @ self.prescribed.value.ravel()
         c[sets.normals] = left[normals.condition] * normals.scale
         slides = tangents.moves | tangents.drawn
         c[sets.tangents] = np.where(slides, slips * tangents.scale[:, None], 0.0)
@@ -399,7 +252,7 @@ def glue(
         decided = np.intersect1d(contact.decided, rigid.condition)
         tools.check_nodes(records.contact[decided])
     sliding_rows, tangents = tangent_rows(dofs, builder, contact)
-    equalities, held = equality_rows(dofs, prescribed.flag, D)
+    equalities, to_equalities = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
     constraints = assemble_constraints(
         dofs,
@@ -411,7 +264,9 @@ def glue(
         tools.num_unknowns if tools else 0,
     )
     slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
-    gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)
+    gluing = Gluing(
+        dofs, prescribed, records, to_equalities, contact, tangents, constraints, length, slip
+    )
     try:
         return gluing.with_right_side(prescribed.value, records.gap)
     except TfetiError:  # on all ranks

@@ -19,8 +19,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 class RowTolerances:
     """Tolerances of rows."""
 
-    # values that conditions prescribe at a node differ by less, relative to all
-    agreement: float = 1e-10
     # of a row's norm: if prescribed components leave less, rounding of the normal has made it
     # (ε|x|/h of a facet of size h at x), and the row is dropped
     nothing_left: float = 1e-6
@@ -125,6 +123,8 @@ class Constraints:
     # the s_i of the conditions with rows, one for each of `sets.normals`: over it what a row misses
     # is a length
     scale: Array
+    # ∫φ_i of the same conditions, times the thickness; 0 without friction, and a set of one's own
+    area: Array
     tangent_scale: Array  # the same for each point of `sets.tangents`, shape (t,)
     # the ψ_i, semi-axes of the sets of the tangential multipliers, shape (t, gdim - 1); 0 until
     # they are set
@@ -249,6 +249,7 @@ def assemble_constraints(
         trace=trace,
         weights=weights[trace],
         scale=scale,
+        area=np.zeros(len(scale)),
         tangent_scale=tangent_scale,
         limits=np.zeros(shape),
         pressed_by=row,

@@ -31,9 +31,9 @@ from tfeti_dolfinx.mortar.facets import (
     local_facets,
     surface_facets,
     with_averaged_normals,
-    with_held_vertices,
 )
 from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_curvature
+from tfeti_dolfinx.mortar.multipliers import with_held_vertices
 from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
@@ -91,6 +91,7 @@ class ContactPartner(ABC):
             raise InputError(f"{self.name}: reach={reach!r}, expected a positive length or None")
         return float(reach)
 
+    @abstractmethod
     def settled(
         self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, flag: Flag = None
     ) -> tuple[ContactPartner, ContactRecords]:
@@ -99,7 +100,6 @@ class ContactPartner(ABC):
         ``stiffness`` is the block of K of each primal node, shape ``(num_nodes, bs, bs)``; None:
         the sides are those of an earlier search.
         """
-        return self, self.records(dofs, contact, reach, reach, flag)
 
     def with_gap(self, gap: Gap) -> Self:
         """Return the same contact with another ``gap=``."""
@@ -255,12 +255,13 @@ class Obstacle(ContactPartner):
 
         At the first search the shape has to fit: later the surface may have turned away from it.
         """
-        # of a scalar space the gradient's first component counts
-        first = stiffness is not None and dofs.bs > 1
-        return self, self._met(dofs, contact, reach, flag, first)
+        if stiffness is not None and dofs.bs > 1:  # else the gradient's first component counts
+            self._check_shape(dofs)
+        return self, self.records(dofs, contact, reach, reach, flag)
 
-    def _check_shape(self, dofs: TornDofs, facets: Facets) -> None:
+    def _check_shape(self, dofs: TornDofs) -> None:
         """Raise an InputError unless the gradient is the distance's and a facet faces the shape."""
+        facets = local_facets(dofs, dofs.decomposition.facets(self.surface), facet_kind(dofs))
         centres, size = facets.corners.mean(axis=1), diameter(dofs.decomposition)
         check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
@@ -280,16 +281,8 @@ class Obstacle(ContactPartner):
         given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
         n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
-        return self._met(dofs, contact, reach, flag)
-
-    def _met(
-        self, dofs: TornDofs, contact: int, reach: float, flag: Flag, first: bool = False
-    ) -> ContactRecords:
-        """Return the conditions of ``records``, at first of a shape that fits. Collective."""
         kind = facet_kind(dofs)
         facets = local_facets(dofs, dofs.decomposition.facets(self.surface), kind)
-        if first:
-            self._check_shape(dofs, facets)
         corners = facets.corners
         with raised_on_all_ranks(dofs.comm):
             distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)

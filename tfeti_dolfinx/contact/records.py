@@ -13,7 +13,8 @@ from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, largest, summed
 from tfeti_dolfinx.mesh.dofs import Owners, TornDofs
 from tfeti_dolfinx.mortar.facets import Facets, hat_integrals
-from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals, Triplets
+from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals
+from tfeti_dolfinx.mortar.multipliers import Triplets
 from tfeti_dolfinx.mortar.segments import frames
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
@@ -29,7 +30,7 @@ class Friction(IntEnum):
 
 
 # tables of whole numbers, and of flags
-WHOLE = ("contact", "group", "condition", "entry_group", "friction", "held", "beside")
+WHOLE = ("contact", "group", "condition", "entry_group", "friction", "held", "neighbour")
 FLAGS = ("conforms", "within_reach")
 
 
@@ -67,10 +68,10 @@ class ContactRecords:
     friction: Array  # `Friction` of each condition, shape (n,)
     place: Array  # Σ_j w_ij x_j, where a rigid body that moves meets it, else 0, shape (n, gdim)
     motion: Array  # displacement of that body there, as far as it is known, shape (n, gdim)
-    # neighbours of vertices that are held, which say what pressure these bear: the condition, the
+    # neighbours of vertices that are held, see `held_pressures`: the condition of the vertex, the
     # global group of the neighbour, and its share, which add up to 1, shape (p,)
     held: Array
-    beside: Array
+    neighbour: Array
     share: Array
     candidates: int = 0  # nodes of the contact surface whose groups this rank owns
 
@@ -130,6 +131,23 @@ def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     return np.einsum("ntg,ng->nt", records.tangents, relative_displacement(records, dofs, u))
 
 
+def held_pressures(
+    records: ContactRecords, dofs: TornDofs, contacts: int, pressure: Array
+) -> Array:
+    """Return pressures that vertices which conditions hold bear, else 0, shape ``(n,)``.
+
+    Those are means of their neighbours in the same one of so many contacts, from pressures of all
+    conditions. Collective.
+    """
+    found, of_vertex = np.zeros(len(records.held)), records.contact[records.held]
+    for contact in range(contacts):
+        own, of = records.contact == contact, of_vertex == contact
+        known = np.zeros(dofs.num_groups)
+        known[records.group[own]] = pressure[own]
+        (found[of],) = dofs.lookup(records.neighbour[of], known)
+    return sum_rows(records.held, records.share * found, len(records))
+
+
 # --- Conditions from integrals ----------------------------------------------------------------
 
 
@@ -169,9 +187,9 @@ def conditions(
     slot, column, value = _merged(dofs, integrals.entries)
     kept = (place[slot] >= 0) & (np.abs(value) > SEARCH.negligible * np.maximum(area[slot], 1e-300))
     slot, column, value = slot[kept], column[kept], value[kept]
-    of, beside, share = _merged(dofs, (integrals.shares,))
+    of, neighbour, share = _merged(dofs, (integrals.shares,))
     kept = place[of] >= 0
-    held, beside, share = place[of[kept]], beside[kept], share[kept]
+    held, neighbour, share = place[of[kept]], neighbour[kept], share[kept]
     return ContactRecords(
         contact=np.full(len(chosen), contact),
         group=chosen,
@@ -190,7 +208,7 @@ def conditions(
         place=np.zeros((len(chosen), dofs.bs)),
         motion=np.zeros((len(chosen), dofs.bs)),
         held=held,
-        beside=beside,
+        neighbour=neighbour,
         share=share / sum_rows(held, share, len(chosen))[held],
         candidates=int(np.sum(whole > 0.0)),
     )

@@ -1,6 +1,5 @@
 """The search for contact conditions of obstacles and pairs."""
 
-import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -15,10 +14,8 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import diameter, facet_nodes
+from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.mortar.tolerances import SEARCH
-
-log = logging.getLogger(__name__)
 
 
 class ContactSearch:
@@ -37,7 +34,6 @@ class ContactSearch:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
         length: Length of the scene.
         records: All conditions of this rank; those ``within_reach`` get rows.
-        said: Contacts that ``warn_of`` has named.
     """
 
     def __init__(
@@ -54,7 +50,7 @@ class ContactSearch:
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
-        self._reach, self.said = list(self._depths), list[str]()
+        self._reach = list(self._depths)
         check_together(contacts, decomposition)
         settled = [
             contact.settled(dofs, i, self._reach[i], stiffness, flag)
@@ -69,9 +65,7 @@ class ContactSearch:
     def _nodes(self) -> list[list[Array]]:
         """Primal nodes of the surfaces of each contact."""
         dofs, facets = self._dofs, self._dofs.decomposition.facets
-        return [
-            [np.unique(facet_nodes(dofs, facets(s))) for s in c.surfaces] for c in self.contacts
-        ]
+        return [[np.unique(dofs.facet_nodes(facets(s))) for s in c.surfaces] for c in self.contacts]
 
     @property
     def records(self) -> ContactRecords:
@@ -194,14 +188,6 @@ class ContactSearch:
     def named(self, positions: Iterable[int] | Array) -> list[str]:
         """Contacts as reports name them: position in the list, and name."""
         return [f"{i}: {self.contacts[i].name}" for i in positions]
-
-    def warn_of(self, unmet: list[str]) -> None:
-        """Log on rank 0 which contacts have met nobody, once."""
-        new = [contact for contact in unmet if contact not in self.said]
-        self.said = self.said + new
-        for contact in new:
-            if self._dofs.comm.rank == 0:
-                log.warning("contact %s has nothing within reach=, and no constraints", contact)
 
     def _approach(self, nodes: Sequence[Array], u: Array) -> float:
         """Sum of both surfaces' largest displacements against their common mean, on all ranks."""

@@ -23,7 +23,6 @@ from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.files import checked_path
 from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.untorn import NO_TAG
 from tfeti_dolfinx.solution import Solution
 
@@ -81,28 +80,7 @@ def write_xdmf(
     Raises:
         InputError: The name does not end with ``.xdmf``, else as for ``write_vtx``.
     """
-    target = checked_target(path, ".xdmf", solution, interior)
-    comm, mesh = solution.decomposition.comm, solution.decomposition.mesh
-    changing = chain(*changing_fields(solution, interior), cell_fields(solution))
-    functions = [_as_geometry(f, solution.decomposition) for f in changing]
-    companion = target.with_suffix(".h5")
-    folder = begin_file(target.with_name(f"{target.stem}.folder"), comm, is_folder=True)
-    try:
-        _reserve(target, comm, _bytes_of(functions))
-        with raised_on_all_ranks(comm), named(f"cannot write {target}"):
-            xdmf = io.XDMFFile(comm, folder / target.name, "w")
-        with _written_by(xdmf, target, comm):
-            xdmf.write_mesh(mesh)
-            for function in functions:
-                xdmf.write_function(function)
-            xdmf.close()
-    except TfetiError:  # on all ranks
-        _drop(folder, comm)
-        raise
-    for name in (companion, target):
-        end_file(folder / name.name, name, comm)
-    _drop(folder, comm)
-    return [target, companion]
+    return _one_step(checked_target(path, ".xdmf", solution, interior), solution, interior)
 
 
 def write_pvd(
@@ -139,7 +117,7 @@ def _one_step(target: Path, solution: Solution, interior: bool) -> list[Path]:
 
 
 class SeriesFile:
-    """A VTX file, or a PVD file with its parts in a folder, of another name until it is whole.
+    """A VTX, PVD or XDMF file, in a folder but for VTX, of another name until it is whole.
 
     Creation and methods are collective. ADIOS2 throws where a disk is full, throws again in its
     destructor, which ends the process, and lets other ranks wait for the one that has failed. So
@@ -148,7 +126,7 @@ class SeriesFile:
 
     Args:
         name: Its name once it is whole.
-        functions: What it has, all of one mesh; of a PVD file on the nodes of one element, and one
+        functions: What it has, all of one mesh; but for VTX on the nodes of one element, and one
             value a cell.
 
     Attributes:
@@ -157,54 +135,72 @@ class SeriesFile:
 
     def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
         self._name, self._comm = name, functions[0].function_space.mesh.comm
-        self._functions, self._count, self._has_parts = list(functions), 0, name.suffix == ".pvd"
-        self._bytes = _bytes_of(functions) * (3 if self._has_parts else 1)  # numbers are texts
-        self.partial = begin_file(name, self._comm, self._has_parts)
+        self._functions, self._count, self._kind = list(functions), 0, name.suffix
+        self._bytes = _bytes_of(functions) * (3 if self._kind == ".pvd" else 1)  # texts
+        self.partial = name.with_name(f".{name.name}.partial")
+        with raised_on_all_ranks(self._comm), named(f"cannot write {name}", OSError):
+            if self._comm.rank == 0:
+                name.parent.mkdir(parents=True, exist_ok=True)
+                _remove(self.partial)  # of an earlier run
+                if self._kind != ".bp":
+                    self.partial.mkdir()
         self._writer: Any = None
-        if not self._has_parts:
-            _reserve(name, self._comm, LITTLE)
-        with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
-            if self._has_parts:
-                self._writer = io.VTKFile(self._comm, self.partial / name.name, "w")
-            else:
-                self._writer = io.VTXWriter(self._comm, self.partial, self._functions, engine="BP4")
+        try:
+            if self._kind != ".pvd":  # which is begun without a byte
+                _reserve(name, self._comm, LITTLE)
+            with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
+                if self._kind == ".bp":
+                    functions = self._functions
+                    self._writer = io.VTXWriter(self._comm, self.partial, functions, engine="BP4")
+                else:
+                    kind = io.VTKFile if self._kind == ".pvd" else io.XDMFFile
+                    self._writer = kind(self._comm, self.partial / name.name, "w")
+        except TfetiError:  # on all ranks
+            _drop(self.partial, self._comm)
+            raise
 
     def write(self, time: float) -> None:
         """Add what the functions and the mesh have; times before this one are whole."""
-        before = 0 if self._has_parts else self._count * self._bytes
+        before = self._count * self._bytes if self._kind == ".bp" else 0
         _reserve(self._name, self._comm, self._bytes, before)
-        given = (self._functions, time) if self._has_parts else (time,)
         writer, self._writer = self._writer, None  # where it fails it is never used again
         with _written_by(writer, self._name, self._comm):
-            (writer.write_function if self._has_parts else writer.write)(*given)
+            if self._kind == ".bp":
+                writer.write(time)
+            elif self._kind == ".pvd":
+                writer.write_function(self._functions, time)
+            else:
+                writer.write_mesh(self._functions[0].function_space.mesh)
+                for function in self._functions:
+                    writer.write_function(_as_geometry(function), time)
         self._writer, self._count = writer, self._count + 1
 
     def close(self) -> None:
         """Write what is left; of VTK the destructor does it, and makes folders that are missing."""
         writer, self._writer = self._writer, None
-        if writer is not None and not self._has_parts:
+        if writer is not None and self._kind != ".pvd":
             with _written_by(writer, self._name, self._comm):
                 writer.close()
 
     def appear(self) -> list[Path]:
         """Give the files their names, in the place of those of an earlier run."""
-        if not self._has_parts:
-            end_file(self.partial, self._name, self._comm)
-            return [self._name]
         self._comm.barrier()
-        own = re.compile(re.escape(self._name.stem) + r"(_p\d+_)?\d{6}\.p?vtu")
-        names: list[str] = []
+        names, parent = [self._name.name], self._name.parent
         with raised_on_all_ranks(self._comm), named(f"cannot write {self._name}", OSError):
             if self._comm.rank == 0:
-                names = sorted(file.name for file in self.partial.iterdir())
                 _remove(self._name)  # first: it names parts
-                for file in list(self._name.parent.iterdir()):
-                    if own.fullmatch(file.name):
+                if self._kind == ".bp":
+                    os.replace(self.partial, self._name)
+                if self._kind == ".pvd":
+                    own = re.compile(re.escape(self._name.stem) + r"(_p\d+_)?\d{6}\.p?vtu")
+                    for file in [file for file in parent.iterdir() if own.fullmatch(file.name)]:
                         file.unlink()
-                for part in sorted(names, key=lambda part: part == self._name.name):
-                    os.replace(self.partial / part, self._name.with_name(part))
+                if self._kind != ".bp":
+                    names += sorted({file.name for file in self.partial.iterdir()} - {*names})
+                    for part in reversed(names):
+                        os.replace(self.partial / part, parent / part)
         _drop(self.partial, self._comm)
-        return [self._name.with_name(part) for part in self._comm.bcast(names, root=0)]
+        return [parent / part for part in self._comm.bcast(names, root=0)]
 
 
 class Series:
@@ -215,7 +211,7 @@ class Series:
 
     Args:
         target: A name that ends with ``.bp``, cell fields go to ``<stem>_cells.bp``; or with
-            ``.pvd``, which has all fields.
+            ``.pvd`` or ``.xdmf``, which have all fields.
         solution: A solution of the problem: its mesh and which fields there are.
         interior: Whether the fields of ``solution.interior`` are written, too: those of cells at
             each step, other cell fields are always the same.
@@ -232,7 +228,7 @@ class Series:
         self._files: list[SeriesFile] = []
         of_cells = cell_fields(solution) + cellwise
         try:
-            if target.suffix == ".pvd":
+            if target.suffix != ".bp":
                 self._files.append(SeriesFile(target, nodal + of_cells))
             else:
                 self._files.append(SeriesFile(target, nodal))
@@ -352,10 +348,10 @@ def _cell_function(W: fem.FunctionSpace, name: str, values: Array) -> fem.Functi
     return function
 
 
-def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Function:
+def _as_geometry(function: fem.Function) -> fem.Function:
     """Return the function on the element of the mesh geometry; cell functions as they are."""
     V = function.function_space
-    degree = decomposition.mesh.ufl_domain().ufl_coordinate_element().degree
+    degree = V.mesh.ufl_domain().ufl_coordinate_element().degree
     if V.element.basix_element.degree in (0, degree):
         return function
     shape = function.ufl_shape
@@ -379,27 +375,6 @@ def checked_target(
                 whose = " that VTX has not written" if name.suffix == ".bp" else ""
                 raise InputError(f"{name} is a directory{whose}; expected a file")
     return target
-
-
-def begin_file(name: Path, comm: MPI.Intracomm, is_folder: bool = False) -> Path:
-    """Name to write to until the file is whole; what an earlier run left there is removed."""
-    partial = name.with_name(f".{name.name}.partial")
-    with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
-        if comm.rank == 0:
-            name.parent.mkdir(parents=True, exist_ok=True)
-            _remove(partial)
-            if is_folder:
-                partial.mkdir()
-    return partial
-
-
-def end_file(partial: Path, name: Path, comm: MPI.Intracomm) -> None:
-    """Give a whole file its name. Collective."""
-    comm.barrier()
-    with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
-        if comm.rank == 0:
-            _remove(name)
-            os.replace(partial, name)
 
 
 def _reserve(name: Path, comm: MPI.Intracomm, size: int, before: int = 0) -> None:

@@ -28,7 +28,6 @@ from tfeti_dolfinx.common.validation import (
     shown,
     values_at,
 )
-from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.contact.partner import Obstacle
 from tfeti_dolfinx.contact.rigid_body import Pose, RigidBody
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
@@ -42,12 +41,6 @@ FIELDS = {
     "pressure": "contact pressure",
     "status": "status",
     "bodies": "bodies",
-}
-# by status, its name and colour
-STATUS = {
-    ContactStatus.OPEN: ("open", "lightgrey"),
-    ContactStatus.SLIP: ("slip", "tab:orange"),
-    ContactStatus.STICK: ("stick", "tab:blue"),
 }
 # around the bodies, of their size; and points along an axis, for obstacles
 MARGIN, SAMPLES = 0.08, {2: 401, 3: 61}
@@ -281,10 +274,10 @@ def plot_friction(
                 look = {"angles": "xy", "scale_units": "xy", "scale": scale, "width": 0.002}
                 plot.quiver(*x.T, *arrows.T, **look)
                 plot.update_datalim(x + arrows / scale)
-            for value, (name, colour) in STATUS.items():
+            for value, name in draw.STATUS_NAMES.items():
                 if np.any(at := status == value):
-                    here = f"{name}: {at.sum()}"
-                    plot.plot(*x[at].T, "o", markersize=3, color=colour, label=here)
+                    look = {"color": draw.STATUS[value], "label": f"{name}: {at.sum()}"}
+                    plot.plot(*x[at].T, "o", markersize=3, **look)
             plot.set_aspect("equal")
             plot.margins(0.15)
             plot.set(xlabel=labels[0], ylabel=labels[1])

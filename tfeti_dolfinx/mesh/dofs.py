@@ -14,7 +14,7 @@ from tfeti_dolfinx.common.parallel import Exchange, chunk_offsets, owner_of
 from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.untorn import cell_entities, exchange_by_key, mix, set_key
+from tfeti_dolfinx.mesh.untorn import cell_entities, cells_at, exchange_by_key, mix, set_key
 
 # the exchange with the owners of groups, and which of theirs each row asks
 Owners = tuple[Exchange, Array]
@@ -155,6 +155,13 @@ class TornDofs:
         """Return the place of each primal node, shape ``(n, 3)``."""
         x = self.V.tabulate_dof_coordinates() if self.nodes is None else self.nodes
         return np.asarray(x.take(self.dolfinx_node, axis=0))
+
+    def facet_nodes(self, facets: Array) -> Array:
+        """Return the primal nodes of local exterior facets, vertices first, shape ``(n, t)``."""
+        cell, place = cells_at(self.V.mesh, facets)
+        on_facet = np.array(self.V.element.basix_element.entity_closure_dofs[-2])[place]
+        nodes = np.take_along_axis(np.asarray(self.V.dofmap.list)[cell], on_facet, axis=1)
+        return self.primal_node[nodes]
 
     def to_primal(self, values: Array) -> Array:
         """Unrolled dof values from DOLFINx's order to primal order, shape ``(n * bs,)``."""

@@ -77,6 +77,15 @@ def cell_facets(mesh: dmesh.Mesh) -> Array:
     return facets[: mesh.topology.index_map(tdim).size_local]
 
 
+def cells_at(mesh: dmesh.Mesh, facets: Array) -> tuple[Array, Array]:
+    """Return the cells of local exterior facets, and their places there."""
+    fdim = mesh.topology.dim - 1
+    mesh.topology.create_connectivity(fdim, fdim + 1)
+    cells = mesh.topology.connectivity(fdim, fdim + 1)
+    cell = cells.array[cells.offsets[facets]]
+    return cell, np.argmax(cell_facets(mesh)[cell] == facets[:, None], axis=1)
+
+
 def facet_points(mesh: dmesh.Mesh, facets: Array) -> Array:
     """Geometry nodes of local facets, shape ``(n, nodes_per_facet)``."""
     fdim = mesh.topology.dim - 1

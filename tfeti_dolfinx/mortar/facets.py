@@ -11,7 +11,6 @@ import basix
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx import mesh as dmesh
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import geometry_dofmap
@@ -19,7 +18,7 @@ from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks, count_over
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mesh.untorn import cell_facets, facet_points
+from tfeti_dolfinx.mesh.untorn import cells_at, facet_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 create_element = cache(basix.create_element)  # each is made once
@@ -134,27 +133,10 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
     )
 
 
-def _cells_at(mesh: dmesh.Mesh, facets: Array) -> tuple[Array, Array]:
-    """Return the cells of local exterior facets, and their places there."""
-    fdim = mesh.topology.dim - 1
-    mesh.topology.create_connectivity(fdim, fdim + 1)
-    cells = mesh.topology.connectivity(fdim, fdim + 1)
-    cell = cells.array[cells.offsets[facets]]
-    return cell, np.argmax(cell_facets(mesh)[cell] == facets[:, None], axis=1)
-
-
-def facet_nodes(dofs: TornDofs, facets: Array) -> Array:
-    """Return the primal nodes of local exterior facets, vertices first, shape ``(n, t)``."""
-    cell, place = _cells_at(dofs.V.mesh, facets)
-    on_facet = np.array(dofs.V.element.basix_element.entity_closure_dofs[-2])[place]
-    nodes = np.take_along_axis(np.asarray(dofs.V.dofmap.list)[cell], on_facet, axis=1)
-    return dofs.primal_node[nodes]
-
-
 def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     """Data of local facets of the true boundary, without averaged normals."""
     mesh = dofs.V.mesh
-    gdim, (cell, place) = mesh.geometry.dim, _cells_at(mesh, facets)
+    gdim, (cell, place) = mesh.geometry.dim, cells_at(mesh, facets)
     coordinate = mesh.ufl_domain().ufl_coordinate_element()
     of_cell = create_element(
         basix.ElementFamily.P, coordinate.cell_type, coordinate.degree, coordinate.lagrange_variant
@@ -172,28 +154,13 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     sign = np.sign(np.sum(at_vertices * normal, axis=2, keepdims=True))
     return Facets(
         x=np.ascontiguousarray(x),
-        groups=dofs.group[facet_nodes(dofs, facets)],
+        groups=dofs.group[dofs.facet_nodes(facets)],
         normal=normal,
         vertex_normals=np.ascontiguousarray((sign * unit(at_vertices)).swapaxes(0, 1)),
         area=area,
         curvature=np.zeros((len(x), gdim, gdim)),
         held=np.zeros((len(x), hats.size), dtype=bool),
     )
-
-
-def with_held_vertices(
-    facets: Facets, dofs: TornDofs, normals: Array, flag: Array | None
-) -> Facets:
-    """Return the same facets with flags of vertices that Dirichlet conditions hold. Collective.
-
-    Normals and flags of prescribed components are those of owned groups, shape ``(g, gdim)``; None:
-    nothing is prescribed.
-    """
-    if flag is None:
-        return facets
-    fixed = np.all(flag | (np.abs(normals) <= SEARCH.held), axis=1)
-    (held,) = dofs.lookup(facets.vertices.ravel(), fixed)
-    return replace(facets, held=held.reshape(facets.vertices.shape))
 
 
 def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array]:

@@ -104,13 +104,14 @@ def solve_with_friction(
     newton = NewtonOnLaw(dual, options, least, parameters)
     rtol, change, aim, near = parameters.first, np.inf, np.inf, False
     steps, looks, iterations = Steps(), 0, 0
+    # Step 0: the first bounds: of Newton's method on the law, else those of the start
     law = newton.solve(start, bounds)
     motion = None if law else bounds.hold()
     while True:
         # Step 1: the problem with these bounds; those of the law are worth all digits
         if law is None:
             rtol = least if near else max(least, min(rtol, parameters.share * change))
-        asked = rtol if law is None else least
+        asked = least if law else rtol
         exact = goal if asked <= least else None
         # how exact the first of the law has to be a look tells
         limited = replace(options, max_it=0) if law and aim == np.inf else options
@@ -119,27 +120,29 @@ def solve_with_friction(
         )
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         reached = parameters.looser * rule.tolerance
+        # Step 2: without an answer other bounds, or more steps of Newton's method
         if result.reason <= 0:
-            if law is None and not bounds.turn(result):
+            if law:
+                looked = aim == np.inf and result.reason == ConvergedReason.DIVERGED_ITS
+                law = newton.go_on(law, bounds, reached, looked)
+            elif not bounds.turn(result):
                 break
-            looked = aim == np.inf and result.reason == ConvergedReason.DIVERGED_ITS
-            law = law and newton.go_on(law, bounds, reached, looked)
             aim = reached
             if not law and (motion := bounds.hold()) is not None:
                 break
             continue
-        # Step 2: its forces of normals, beside those that the bounds are of
+        # Step 3: its forces of normals, beside those that the bounds are of
         change = bounds.change(result.lam)
         near = change <= parameters.near * tolerance
         aim = reached * min(1.0, least / asked)  # residuals and errors fall together
-        # Step 3: where they are at rest, what they leave of the law
+        # Step 4: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
             if goal is not None or bounds.fit(result, rule):
                 break
             if newton.tries == 0 and (bounds.idle > 1 or iterations >= options.friction_max_it):
                 result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
                 break
-        # Step 4: the next bounds: of Newton's method on the law, or those forces
+        # Step 5: the next bounds: of Newton's method on the law, or those forces
         # where nothing was to do the change tells nothing of the error of bounds: finer, first
         moved = law is not None or result.steps.inner > 0
         rtol *= 1.0 if moved else parameters.share
@@ -147,9 +150,10 @@ def solve_with_friction(
         bounds.advance()
         law = newton.solve(start, bounds, aim) if moved else None
         found = bounds.now
-        motion, idle = None if law else bounds.hold(), bounds.idle > parameters.patience
+        motion = None if law else bounds.hold()
         start = start if bounds.now is found else None  # with other bounds anew
-        if motion is not None or idle or iterations >= options.friction_max_it:
+        restless = bounds.idle > parameters.patience or iterations >= options.friction_max_it
+        if motion is not None or restless:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
     result.steps = steps
@@ -186,8 +190,8 @@ class FrictionBounds:
 
     Attributes:
         now: The present ones, of each of ``constraints.pressed``; ∞: the point sticks.
+        found: The forces of normals of the last problem.
         body: The body on which they changed most at last; -1 before.
-        before: Those before the last try of others.
         idle: Problems in a row whose change is not half of the least one before.
     """
 
@@ -195,23 +199,31 @@ class FrictionBounds:
         self, dual: Dual, start: tuple[Array, Array] | None, parameters: CoulombParameters
     ) -> None:
         self._dual, self._parameters, self._comm = dual, parameters, dual.coarse.comm
-        constraints = self._constraints = dual.constraints
-        at = constraints.pressed
+        constraints, coarse = dual.constraints, dual.coarse
+        self._constraints, at = constraints, constraints.pressed
         self._rows = constraints.pressed_by[at]
         self._mu = np.linalg.norm(constraints.coefficients[at], axis=1)
-        self._slipped = self._wedged = False
-        stuck = [] if start is None else [np.inf]
-        self._others = [*stuck, *parameters.shares]
         self.now: Array = np.full(len(self._rows), np.inf)
         if start is not None:
             known = dual.pressures[at]
             lost = any_rank(self._comm, not np.all(np.isfinite(known)))
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
-            self.now = np.where(self._unknown(), np.inf, self.now)
-        self.before, self._found = self.now, self.now
-        self._none, self._best, self._length = 0.0, np.inf, 1.0
-        self.idle, self.body, self._falls = 0, -1, 0
-        self._solved: list[tuple[Array, Array]] = []
+            # points stick on bodies that friction may hold, and whose forces tell nothing of it;
+            # where slips count from elsewhere, a body was let go, and would be drawn back there
+            tangents = constraints.sets.tangents
+            loose = np.any(coarse.unheld.free, axis=1) & (self._on_bodies(self.now) == 0.0)
+            loose &= not any_rank(self._comm, constraints.c[tangents])
+            on_loose = np.zeros(constraints.num_rows, dtype=bool)
+            on_loose[coarse.J.row[loose[coarse.J.body]]] = True
+            unknown = np.any(on_loose[tangents[at]], axis=1) & (self._mu > 0.0)
+            self.now = np.where(unknown, np.inf, self.now)
+        # what ``hold`` and ``turn`` have not tried yet
+        self._others = [*([] if start is None else [np.inf]), *parameters.shares]
+        self._turns = 2
+        self.found = self.now
+        self._last: tuple[Array, Array] | None = None  # bounds and forces before these
+        self._none, self._best, self._falls = 0.0, np.inf, 0
+        self.idle, self.body = 0, -1
 
     @property
     def stick(self) -> bool:
@@ -227,9 +239,9 @@ class FrictionBounds:
         dual, first = self._dual, None
         while True:
             dual.bound_friction(self.now)
-            motion = None
-            if not self.stick:
-                motion = sliding_motion(dual.coarse, dual.constraints, dual.pulling)
+            if self.stick:
+                return None
+            motion = sliding_motion(dual.coarse, dual.constraints, dual.pulling)
             first = motion if first is None else first
             if motion is None or not self._others:
                 return None if motion is None else first
@@ -258,10 +270,10 @@ class FrictionBounds:
         lost = reason in (ConvergedReason.DIVERGED_STALLED, ConvergedReason.DIVERGED_ROUNDING)
         contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
         found = self.forces_of(result.lam)
-        if (lost or contradicts) and not self._slipped and not slips:
-            self.now, self._slipped = np.zeros(len(self._rows)), True
-        elif lost and not self._wedged and any_rank(self._comm, found > 0.0):
-            self.now, self._slipped, self._wedged = found, True, True
+        if (lost or contradicts) and self._turns == 2 and not slips:
+            self.now, self._turns = np.zeros(len(self._rows)), 1
+        elif lost and self._turns and any_rank(self._comm, found > 0.0):
+            self.now, self._turns = found, 0
         else:
             return False
         return True
@@ -277,70 +289,57 @@ class FrictionBounds:
         most = max(norm_over(self._comm, values), driving)
         moves_none = float(np.min(self._dual.negligible)) / (self._dual.seen or np.inf)
         self._none = max(parameters.no_force * most, moves_none)
-        self._found = self.forces_of(values)
-        self._solved = [*self._solved[-1:], (self.now, self._found)]
+        self.found = self.forces_of(values)
         if self.stick:
             return float("inf")
         nothing = np.full(len(self._rows), self._none)
-        miss, size, least = map(self._on_bodies, (self._found - self.now, self._found, nothing))
+        miss, size, least = map(self._on_bodies, (self.found - self.now, self.found, nothing))
         lightest = parameters.light * size.max(initial=0.0)
         size = np.maximum(size, max(least.max(initial=TINY), lightest))
         self.body = int(np.argmax(miss / size))
         miss = np.where(miss > least, miss, 0.0)  # less is rounding
         change = float(miss[self.body] / size[self.body])
         self.idle += 1
-        self._length = self._relaxation()
         self._falls = self._falls + 1 if change > 1.0 else 0
         if change <= 0.5 * self._best:
             self._best, self.idle = change, 0
         return change
 
-    def _relaxation(self) -> float:
-        """Return the share of the next step: Aitken's (Irons, Tuck, IJNME 1, 1969), 1 at most."""
-        if len(self._solved) < 2:
-            return 1.0
-        (first, of_first), (now, found) = self._solved
-        if any_rank(self._comm, np.isinf(first)):  # all stuck
-            return 1.0
-        way, turn = now - first, (found - now) - (of_first - first)
-        along, size = summed(self._comm, np.array([-(way @ turn), turn @ turn]))
-        share = along / size if along > 0.0 else 1.0  # else they run away, to other ones
-        return float(steering(self._comm, np.clip(share, self._parameters.shortest, 1.0))[0])
-
     def fit(self, result: QPResult, rule: Accuracy) -> bool:
         """Return whether u is right to rtol with the limits that the new forces give, too.
 
-        The rule has looked at the answer with the limits that it was found with; from now on it
-        tells the larger errors.
+        From then on the rule tells the larger errors.
         """
-        self._dual.bound_friction(self._found)
+        self._dual.bound_friction(self.found)
         fits = rule.look_again(result.face)
         self._dual.bound_friction(self.now)
         return fits
 
     def advance(self) -> None:
         """Go towards the forces that were found, all of the way unless that has led away."""
+        now, found = self.now, self.found
         # forces that fall to less than half again and again, as where slips of earlier steps alone
         # drive, make a geometric series: of its bounds the limit 0 is tried
         if self._falls == self._parameters.falls and not self.stick:
-            self.now = np.zeros_like(self._found)
-            return
-        whole = self.stick or self._length == 1.0
-        self.now = self._found if whole else self.now + self._length * (self._found - self.now)
+            self.now = np.zeros_like(found)
+        else:
+            share = 1.0 if self.stick else self._relaxation()
+            self.now = found if share == 1.0 else now + share * (found - now)
+        self._last = now, found
+
+    def _relaxation(self) -> float:
+        """Return the share of the next step: Aitken's (Irons, Tuck, IJNME 1, 1969), 1 at most."""
+        if self._last is None or any_rank(self._comm, np.isinf(self._last[0])):  # all stuck
+            return 1.0
+        (first, of_first), now, found = self._last, self.now, self.found
+        way, turn = now - first, (found - now) - (of_first - first)
+        along, size = summed(self._comm, np.array([-(way @ turn), turn @ turn]))
+        share = along / size if along > 0.0 else 1.0  # else they run away, to other ones
+        return float(steering(self._comm, np.clip(share, self._parameters.shortest, 1.0))[0])
 
     def forces_of(self, lam: Array, none: float = 0.0) -> Array:
         """Return the normal forces, those that are rounding or at most ``none`` set to 0."""
         return np.where(lam[self._rows] > max(self._none, none), lam[self._rows], 0.0)
-
-    def _unknown(self) -> Array:
-        """Flags of rows on bodies that friction may hold, and whose forces tell nothing of it."""
-        coarse, rows = self._dual.coarse, np.zeros(self._constraints.num_rows, dtype=bool)
-        loose = np.any(coarse.unheld.free, axis=1) & (self._on_bodies(self.now) == 0.0)
-        # where slips count from elsewhere, a body was let go, and would be drawn back there
-        loose &= not any_rank(self._comm, self._constraints.c[self._constraints.sets.tangents])
-        rows[coarse.J.row[loose[coarse.J.body]]] = True
-        tangents = self._constraints.sets.tangents[self._constraints.pressed]
-        return np.any(rows[tangents], axis=1) & (self._mu > 0.0)
 
     def _on_bodies(self, pressures: Array) -> Array:
         """Return norms of the nodal forces μ times those of normals make on each body."""
@@ -360,7 +359,8 @@ class NewtonOnLaw:
         self._dual, self._rtol, self._parameters = dual, rtol, parameters
         self.tries = parameters.tries if options.friction_type == "newton" else 0
         self.steps, self._share = 0, 1.0
-        self.recycled = dual.recycled
+        self._recycled = dual.recycled
+        self._before: Array = np.zeros(0)  # bounds before those of the last answer
         pairs = (dual.last.d, dual.d), (dual.last.e, dual.coarse.e)
         other = not all(np.array_equal(kept, now) for kept, now in pairs)
         self._rests = not any_rank(dual.coarse.comm, other)
@@ -372,11 +372,11 @@ class NewtonOnLaw:
 
         Then bounds become those before the answer, and Newton's method is tried no more.
         """
-        before = bounds.before
+        before = self._before
         again = self.solve(law, bounds, aim) if looked else None
         if again is None:
-            self.tries, self._dual.recycled, bounds.now = 0, self.recycled, before
-        bounds.before = before
+            self.tries, self._dual.recycled, bounds.now = 0, self._recycled, before
+        self._before = before
         return again
 
     def solve(
@@ -426,13 +426,13 @@ class NewtonOnLaw:
         self.steps, self._share = self.steps + steps, parameters.finer * self._share
         self.tries -= 1
         if end is None:
-            self.tries, dual.recycled = min(self.tries, 1), self.recycled
+            self.tries, dual.recycled = min(self.tries, 1), self._recycled
             return None
         # F of the end stands for that of the nearest point of its set, where the problem begins
         Fx = end.s + qp.coarse.combined(end.mu) + qp.d
         dual.last.x, dual.last.Fx = end.lam, Fx
         dual.last.within = parameters.newton.unseen * target / norm
         # the bounds of multipliers for which the law holds; what cannot be seen bounds none
-        bounds.before, bounds.now = bounds.now, bounds.forces_of(end.lam, dual.last.within)
+        self._before, bounds.now = bounds.now, bounds.forces_of(end.lam, dual.last.within)
         dual.bound_friction(bounds.now)
         return end.lam, end.mu

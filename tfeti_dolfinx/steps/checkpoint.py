@@ -108,14 +108,14 @@ class Checkpoint:
                 self._index = self._checked_folder()
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
         """Keep other runs out of the folder inside the block, while this process lives."""
         lock = None
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
             if self._comm.rank == 0:
                 self._index = self._checked_folder()
                 self.path.mkdir(parents=True, exist_ok=True)
-                lock = _locked(self.path)
+                lock = _lock(self.path)
         try:
             yield
         finally:
@@ -123,7 +123,7 @@ class Checkpoint:
                 os.close(lock)
 
     def forget(self) -> None:
-        """Remove what an earlier series has left, and take the folder, which is held."""
+        """Remove what an earlier series has left, and take the folder, which is locked."""
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
             if self._comm.rank == 0:
                 self._commit(self._index)  # on a full disk nothing goes
@@ -133,7 +133,7 @@ class Checkpoint:
                 self._commit(Index(0, self._comm.size))  # until here it says what is to go
 
     def read(self) -> Kept | None:
-        """Return what was written last, on all ranks; None if there is nothing. It is held.
+        """Return what was written last, on all ranks; None if nothing was. The folder is locked.
 
         What a run that was killed has left beside it is removed. Raise an InputError where it is
         damaged.
@@ -320,7 +320,7 @@ def damaged(file: Path, where: str) -> InputError:
     )
 
 
-def _locked(folder: Path) -> int:
+def _lock(folder: Path) -> int:
     """Lock a folder until the descriptor is closed, where its file system can."""
     lock = os.open(folder, os.O_RDONLY)
     try:

@@ -14,7 +14,6 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.common.validation import checked_flag
-from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact.records import relative_displacement
@@ -31,6 +30,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.nonlinear.forms import InertialNewtonForms
 from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
 from tfeti_dolfinx.problem import ContactProblem
+from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.saved_state import SavedState
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
@@ -100,7 +100,7 @@ class Predictor:
         rows_and_start: Rows, and their multipliers that the next call starts from; None at first.
         image: F of these of a restored state, if it is known.
         multiplications: By F of the mass in the last call.
-        multipliers: Of the last call: M(u − w) = −Bᵀλ.
+        last: λ of the last call, M(u − w) = −Bᵀλ, and its face; None at first.
     """
 
     def __init__(self, dofs: TornDofs, settings: Settings) -> None:
@@ -116,7 +116,7 @@ class Predictor:
         self.rows_and_start: tuple[Gluing, Array] | None = None
         self.image: Array = np.zeros(0)
         self.multiplications = 0
-        self.multipliers: Multipliers | None = None
+        self.last: tuple[Array, Face] | None = None
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -138,9 +138,8 @@ class Predictor:
         dofs, constraints = self._dofs, gluing.constraints
         before, primal = np.array(constraints.c), dofs.to_primal(w)
         total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add)
-        held = total / dofs.multiplicity[:, None]
-        rows = constraints.sets.equalities[gluing.held.row]
-        constraints.c[rows] = held.ravel()[gluing.held.component] * gluing.held.factor
+        values = total / dofs.multiplicity[:, None]
+        constraints.c[constraints.sets.equalities] = gluing.to_equalities @ values.ravel()
         try:
             self._make(M, M @ w, gluing)
             return dofs.to_dolfinx(self._solve(gluing))
@@ -184,7 +183,7 @@ class Predictor:
         self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
         result, accuracy = solve_dual(dual, options, options.qp_type, start)
         self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
-        self.multipliers = Multipliers(result.lam.copy(), result.face)
+        self.last = result.lam.copy(), result.face
         self.multiplications = dual.F.count
         conclude(result, accuracy, options, self._dofs.comm)
         return accuracy.u
@@ -390,8 +389,8 @@ class ContactDynamics(ContactProblem):
         if self._predictor is not None:
             self._predictor.destroy()
 
-    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
-        solution = super()._make_solution(u, multipliers, gluing)
+    def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
+        solution = super()._make_solution(u, lam, face, gluing)
         motion = self._system.forms.inertia.motion
         way = self.dofs.to_dolfinx(u) - motion.towards
         solution.v = motion.start + 2.0 / motion.size * way
@@ -405,7 +404,7 @@ class ContactDynamics(ContactProblem):
         contact, forces = self.solution.gluing.records.contact, self.solution.condition_forces
         total = summed(self.dofs.comm, sum_rows(contact, forces, len(self.contacts)))
         means = [[float(component) for component in force] for force in total]
-        self.report.take(replace(self.report, motion=motion, contact_forces=means))
+        self.report.motion, self.report.contact_forces = motion, means
 
 
 class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
@@ -492,12 +491,12 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         """
         motion, predictor = self._system.forms.inertia.motion, self._predictor
         motion.start, self._blows = motion.v, []
-        if predictor is None or predictor.multipliers is None:
+        if predictor is None or predictor.last is None:
             return
         motion.start = (motion.towards - motion.u) / motion.size
-        forces = replace(predictor.multipliers, lam=predictor.multipliers.lam / motion.size**2)
-        w = self.dofs.to_primal(motion.towards)
-        struck = ContactProblem._make_solution(self, w, forces, self._system.gluing)
+        (lam, face), w = predictor.last, self.dofs.to_primal(motion.towards)
+        forces, gluing = lam / motion.size**2, self._system.gluing
+        struck = ContactProblem._make_solution(self, w, forces, face, gluing)
         self._blows = [struck.contact(i).resultant.force for i in range(len(self.contacts))]
 
     def _look(self) -> None:

@@ -281,7 +281,7 @@ class LoadSteps:
             if resume and self._checkpoint is None:
                 raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
         self._close(drop=True)  # a file that an interrupt has ended
-        with nullcontext() if self._checkpoint is None else self._checkpoint.held():
+        with nullcontext() if self._checkpoint is None else self._checkpoint.locked():
             place = self._begin(resume)
             try:
                 with shown_progress(self._comm, self._progress) as show:

@@ -7,7 +7,6 @@ import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.contact.records import Resultant
-from tfeti_dolfinx.qp.sets import Face
 
 
 class ContactStatus(IntEnum):
@@ -107,11 +106,3 @@ class ToolState:
             for what, (names, values) in parts.items()
             for axis, value in zip(names, values, strict=True)
         }
-
-
-@dataclass(frozen=True)
-class Multipliers:
-    """Multipliers of this rank's rows."""
-
-    lam: Array  # λ, shape (m,)
-    face: Face  # which of them carry a force, and which slip
