@@ -56,6 +56,16 @@ def two_groups(square):
     meshed(square)
 
 
+def sides_alone(square):
+    """Groups of all sides of a square, or of a cube, and none of the body."""
+    if square is None:
+        gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
+        gmsh.model.occ.synchronize()
+    dim = gmsh.model.getDimension() - 1
+    gmsh.model.addPhysicalGroup(dim, [tag for _, tag in gmsh.model.getEntities(dim)], name="sides")
+    gmsh.model.mesh.generate(dim + 1)
+
+
 SOURCES = {
     r"none.msh: no such file; expected a gmsh mesh": lambda s: tfeti.read_gmsh(
         s.folder / "none.msh", s.comm
@@ -66,6 +76,8 @@ SOURCES = {
     r"bare.msh: not a mesh, gmsh finds no nodes": without_nodes,
     r"gmsh.model \(is gmsh initialised, with a model in it\?\)": closed,
     r"the mesh has no physical groups of cells": model(in_group),
+    r"no physical groups of cells; give the bodies": model(sides_alone),
+    r"surfaces that do not lie .* no volumes": model(lambda square: sides_alone(None)),
     r"elements of dimension 2 lie in several physical groups, \['again', 'plate'\]": model(
         two_groups
     ),
