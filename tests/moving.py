@@ -44,9 +44,7 @@ class Thrown:
         V, u, v = vectors(d)
         self.weight = fem.Constant(d.mesh, -weight * np.eye(gdim)[-1])
         velocity = fem.Function(V)
-        velocity.interpolate(
-            lambda x: thrown_velocity(gdim, x, gap / 2 if below else -1.0, *thrown)
-        )
+        velocity.interpolate(lambda x: thrown_velocity(gdim, x, gap / 2 if below else -1, *thrown))
         low, up = (-1.0 if below else -gap), np.eye(gdim)[-1]
         at = fem.Function(V)
         at.x.array[::gdim] = begin

@@ -39,9 +39,7 @@ ROOMS = [
 ]
 PLACE = {room: place for place, rooms in enumerate(ROOMS) for room in rooms}
 # the QP solvers know nothing of meshes and rows, the Blocks nothing of rows
-APART = {
-    (own, room) for own in ("qp", "subdomains") for room in ("mortar", "contact", "constraints")
-}
+APART = {(a, b) for a in ("qp", "subdomains") for b in ("mortar", "contact", "constraints")}
 APART.add(("qp", "mesh"))
 # words that a single module may use: what differs between versions, and a heavy library
 ALONE = {

@@ -157,9 +157,7 @@ def scene(
     ("n", "stiffness", "secondary"),
     [((3, 6), 0.1, LOWER), ((6, 3), 5.0, UPPER), ((16, 15), 5.0, LOWER), ((4, 4), 1.0, None)],
 )
-def test_the_coarser_side_is_taken_and_of_equal_meshes_the_softer_one(
-    n, stiffness, secondary, sides
-):
+def test_the_coarser_side_is_taken_of_equal_meshes_the_softer_one(n, stiffness, secondary, sides):
     p = scene(tfeti.Contact(*sides), n, stiffness)
     expected = secondary or sides[0]  # of two equal ones the first
     assert p.solution.contacts[0].surfaces[0] == expected

@@ -86,6 +86,7 @@ def test_a_reaction_is_the_force_of_the_stress(comm):
     d = decomposed("quadrilateral", 4, 4)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), friction=tfeti.Tresca(0.01))
     p = solved(problem(d, traction=(0.02, -0.05), contacts=[floor], rtol=1e-10))
+    p.destroy()  # its solution stays
     friction = p.solution.contact().resultant
     reaction = p.solution.reaction("left")
     assert np.allclose(reaction.force + friction.force, (-0.02, 0.05), rtol=0, atol=1e-8)

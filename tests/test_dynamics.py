@@ -122,7 +122,7 @@ def test_momentum_changes_by_forces_of_contact():
         now = mean(scene, scene.problem.solution.velocity.x.array.reshape(-1, 2))
         if n:
             assert now - before == pytest.approx(
-                0.1 * (np.array(forces[0]) - [0.0, 0.02]), abs=1e-9
+                0.1 * np.subtract(forces[0], (0.0, 0.02)), abs=1e-9
             )
         impulse, before = impulse + 0.1 * np.array(forces[0]), now
     assert impulse[1] > 0.3

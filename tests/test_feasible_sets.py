@@ -57,9 +57,7 @@ def test_the_face_of_a_product_says_what_each_row_does():
 
 
 def test_a_row_in_two_sets_is_named():
-    with pytest.raises(
-        InputError, match="Product: constraint 4 stands in two sets; expected one at most"
-    ):
+    with pytest.raises(InputError, match="Product: constraint 4 stands in two sets; expected one"):
         Product([(slice(0, 5), Bounds()), (np.array([7, 4]), Bounds())])
 
 

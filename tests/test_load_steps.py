@@ -212,9 +212,7 @@ def series(tmp_path_factory):
         pytest.param(2, "thrown", "committing", marks=pytest.mark.slow),
     ],
 )
-def test_a_killed_series_goes_on_to_the_same_answer(
-    serial_only, tmp_path, series, ranks, scene, how
-):
+def test_a_killed_series_goes_on_to_its_answer(serial_only, tmp_path, series, ranks, scene, how):
     folder = tmp_path / scene
     assert run(ranks, how, folder).returncode != 0
     assert not (folder / "found.npz").exists()

@@ -110,9 +110,15 @@ def test_a_small_displacement_is_that_of_linear_elasticity(name):
         u.interpolate(lambda x: (0.05 * x[0] + 0.04 * x[1], -0.02 * x[1], -0.01 * x[2]))
         law = kind(elastic, u, selective=selective, **given)
         law.update()
-        F = law.residual(ufl.TestFunction(u.function_space))
-        found.append(fem.assemble_vector(fem.form(F)).array)
+        v = ufl.TestFunction(u.function_space)
+        found.append(fem.assemble_vector(fem.form(law.residual(v))).array)
     assert np.abs(found[1] - found[0]).max() < 1e-9 * np.abs(found[0]).max()
+    # and its stress is that of its forces in any small strain
+    u.x.array[:] = 1e-4 * np.random.default_rng(1).normal(size=u.x.array.size)
+    law.update()
+    forms = ufl.inner(law.stress(u), elastic.strain(v)) * law.dx, law.residual(v)
+    found, expected = (fem.assemble_vector(fem.form(form)).array for form in forms)
+    assert np.abs(found - expected).max() < 0.01 * np.abs(expected).max()
 
 
 def test_neo_hooke_is_that_of_the_reference():

@@ -240,9 +240,7 @@ def test_forces_hold_a_light_body_beside_one_that_is_pressed(share, rtol):
     contacts = [tfeti.Obstacle(f"{name} bottom", floor) for name in "abc"]
 
     def load(v, ds):
-        return drawn(d, "a top", (0.0, -0.01))(v, ds) + drawn(d, "b top", (0.0, -0.01 * share))(
-            v, ds
-        )
+        return drawn(d, "a top", (0, -0.01))(v, ds) + drawn(d, "b top", (0, -0.01 * share))(v, ds)
 
     p = solved(two_body_problem(d, load, clamped(d), contacts, rtol=rtol))
     forces = [p.solution.contact(k).resultant.force[1] for k in range(3)]

@@ -67,9 +67,7 @@ def test_a_tool_by_displacement_is_an_obstacle_that_lies_there(gdim):
     assert np.allclose(tool.resultant.force, -contact.resultant.force, rtol=1e-11)
     assert np.abs(moved.solution.contact(0).gap).max(initial=0.0) <= 1e-10
     assert "  tools     moved: punch (0, " in str(moved.report)
-    with pytest.raises(
-        tfeti.InputError, match="tool 3: expected a position or .* of 0: punch; name="
-    ):
+    with pytest.raises(tfeti.InputError, match="tool 3: expected a .* of 0: punch; name="):
         moved.solution.tool(3)
 
 
@@ -504,7 +502,7 @@ def test_a_free_body_that_friction_has_held_is_let_go():
 
 def test_what_jaws_have_carried_stays_where_they_let_it_go():
     """But for the turn that an uneven mesh springs back by; in small and in finite strain."""
-    ways, jaws = [(0.05, 0.0, 0.0), (0.05, 0.05, 0.0), (-0.05, 0.05, 0.0)], []
+    ways, jaws, states = [(0.05, 0.0, 0.0), (0.05, 0.05, 0.0), (-0.05, 0.05, 0.0)], [], {}
     V, u, v = vectors(d := decomposed("hexahedron", 3, 4))
     for name, side in (("left", 1.0), ("right", -1.0)):
         motion = {"displacement": lambda t, side=side: ways[int(t)] * np.array((side, 1, 1))}
@@ -515,10 +513,13 @@ def test_what_jaws_have_carried_stays_where_they_let_it_go():
     F = ufl.derivative(neo_hooke(w, 1.0, 0.3) * DX, w, v)
     small = tfeti.ContactProblem(a, ufl.ZeroBaseForm((v,)), [], jaws, d, petsc_options=TIGHT)
     for problem in (small, tfeti.NonlinearContactProblem(F, w, [], jaws, d, finite=True)):
-        for problem.time in range(3):
-            accepted(problem)
-        assert apart(problem.u.x.array.reshape(-1, 3), [[0, 0.05, 0]]) <= 0.02
-        assert problem.report.F_multiplications <= 60
+        for begin in (0, 1):
+            for problem.time in range(begin, 3):
+                accepted(problem)
+                states[problem.time] = problem.state()
+            assert apart(problem.u.x.array.reshape(-1, 3), [[0, 0.05, 0]]) <= 0.02
+            assert problem.report.F_multiplications <= 60
+            problem.restore(states[0])  # laws still are those of the last step
 
 
 SIDES = {2: polygon([(0, 0), (1, 0), (1, 1), (0, 1)], 1), 3: SPACE["cube"](1)}  # of unit bodies

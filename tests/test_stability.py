@@ -56,7 +56,7 @@ def rung(name, cell, value):
         ("pairs of a node", "tetrahedron", 2, 3, 12.0),
     ],
 )
-def test_a_hard_rung_costs_a_few_times_the_friendly_one(
+def test_a_hard_rung_costs_few_times_the_friendly_one(
     name, cell, friendly, hard, times, serial_only
 ):
     rows = [run_scene(rung(name, cell, value), MPI.COMM_WORLD) for value in (friendly, hard)]
@@ -82,9 +82,7 @@ def test_flatness_knows_boxes_and_simplices(aspect, low):
 
 
 @pytest.mark.parametrize(("nu", "degree"), [(0.3, 1), (0.495, 1), (0.495, 2)])
-def test_displacements_of_degree_1_are_warned_of_where_a_material_keeps_its_volume(
-    nu, degree, caplog
-):
+def test_degree_1_is_warned_of_where_a_material_keeps_its_volume(nu, degree, caplog):
     """In the log once, however many solves there are; printed reports say where."""
     d = decomposed("triangle", 3, 4)
     V, a, L = forms(d.mesh, d.facet_tags, (0, -0.01), d.surface("top"), degree, hooke(2.0, nu))

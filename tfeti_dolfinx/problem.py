@@ -516,7 +516,8 @@ class ContactProblem:
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been. Collective.
 
-        Constants, functions, values, gaps and points must be those that the state was found with.
+        Constants, functions, values, gaps and points must be those that the state was found with;
+        laws of rigid bodies may have others.
 
         Args:
             state: What ``state`` returned on this rank.
@@ -535,6 +536,7 @@ class ContactProblem:
         secondary = list(map(int, state.secondary))
         system.know_rows(list(state.reach), state.groups(self.dofs), secondary)
         system.look_for_changes()
+        system.tools.go_back(state.tools)  # by now laws may have others
         dual = system.make(self._seconds)
         dual.seen = max(dual.seen, float(state.norm))
         state = state.on_rows(system.gluing)

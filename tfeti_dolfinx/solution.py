@@ -92,6 +92,8 @@ class Solution:
         self.u, self.lam = u, lam
         self.carrying, self.holding = face.carrying, face.holding
         self.gluing, self.dofs, self.decomposition = gluing, gluing.dofs, gluing.dofs.decomposition
+        # Bᵀλ now: a problem destroys B with its rows
+        self._row_forces = gluing.constraints.forces(self.lam)
         self.contacts, self.thickness = list(contacts), frozen(thickness)
         self.tool_motions: Sequence[ToolMotion] = ()
         self.finite = False
@@ -427,7 +429,7 @@ class Solution:
         constraints = self.gluing.constraints
         own = constraints.trace < len(self.u)  # those behind are of rigid bodies
         forces = np.zeros_like(self.u)
-        forces[constraints.trace[own]] = -constraints.forces(self.lam)[own]
+        forces[constraints.trace[own]] = -self._row_forces[own]
         total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add)
         force = (total - self.nodal_forces)[groups]
         return resultant(self.dofs.comm, self.places()[groups], force)

@@ -51,9 +51,17 @@ def meshed(square):
     gmsh.model.mesh.generate(2)
 
 
-def two_groups(square):
+def twice(square):
     gmsh.model.addPhysicalGroup(2, [square], name="again")
     meshed(square)
+
+
+def sides(*tags):
+    """Sides of the square, or of a cube, in a group, and no body."""
+    gmsh.model.occ.addBox(0, 0, 0, 1, 1, 1)
+    gmsh.model.occ.synchronize()
+    gmsh.model.addPhysicalGroup(1 if 1 in tags else 2, tags, name="sides")
+    gmsh.model.mesh.generate(2)
 
 
 SOURCES = {
@@ -66,9 +74,9 @@ SOURCES = {
     r"bare.msh: not a mesh, gmsh finds no nodes": without_nodes,
     r"gmsh.model \(is gmsh initialised, with a model in it\?\)": closed,
     r"the mesh has no physical groups of cells": model(in_group),
-    r"elements of dimension 2 lie in several physical groups, \['again', 'plate'\]": model(
-        two_groups
-    ),
+    r"no physical groups of cells; give the bodies": model(lambda square: sides(1, 2)),
+    r"surfaces that do not lie .* no volumes": model(lambda square: sides(2, 3)),
+    r"elements of dimension 2 lie in several physical groups, \['again', 'plate'\]": model(twice),
     r"subdomains=1000: expected between 1 and \d+": model(meshed, 1000),
 }
 

@@ -170,8 +170,11 @@ class Tools:
     def go_back(self, motions: Array | None = None) -> None:
         """Return to where the load step began, or to motions of shape ``(bodies * k,)``."""
         if motions is not None:
-            both = zip(self.begin, motions.reshape(self.law.shape), strict=True)
+            known = motions.reshape(self.law.shape)
+            both = zip(self.begin, known, strict=True)
             self.begin = [replace(pose, motion=motion) for pose, motion in both]
+            law, self.law = self.law, known.copy()
+            self.law[self.tool, self.mode] = law[self.tool, self.mode]
         self.found[:] = 0.0
         self.found[self.tool, self.mode] = self.basis @ self.at_begin()
 

@@ -185,7 +185,10 @@ def untorn_mesh(
     low, high = box_over_ranks(comm, all_x)
     sides = high - low
     if gdim == 2 and sides[2] > 1e-12 * sides.max():  # more than rounding
-        raise InputError("plane cells that do not lie in a plane z = constant: shells are not")
+        raise InputError(
+            "the physical groups have surfaces that do not lie in a plane z = constant, and no "
+            "volumes; expected a group of the bodies, too (shells are not supported)"
+        )
     if shared:
         check_shared(mesh, all_ids, all_x, float(sides.max()), comm)
     partitioned = comm.allreduce(bool(np.all(found.partitions >= 0)), op=MPI.LAND)
@@ -214,7 +217,7 @@ def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -
     own = [(found.kind, (found.kind_name, where)) for found, where in cells]
     for kind, name_and_file in (pair for of_rank in comm.allgather(own) for pair in of_rank):
         kinds.setdefault(kind, name_and_file)
-    if not kinds:
+    if not kinds or top < 2:
         raise InputError(
             "the mesh has no physical groups of cells; give the bodies (3D: volumes, 2D: "
             "surfaces) and the surfaces physical groups in gmsh"

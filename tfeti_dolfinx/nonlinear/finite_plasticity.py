@@ -72,13 +72,13 @@ class FiniteJ2Plasticity(Plasticity):
         self._G_of_u = fem.Expression(self._gradient(u), points)
         self._new = (np.array(self.inverse_plastic.x.array), np.array(self.p.x.array))
         self.state = {self.inverse_plastic: lambda: self._new[0], self.p: lambda: self._new[1]}
-        self.update()
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective.
 
         Where a body is turned inside out all is not a number, which no step ends with.
         """
+        super().update()
         self._G.interpolate(self._G_of_u)
         self._mu.interpolate(self._mu_of_x)
         self._kappa.interpolate(self._kappa_of_x)
@@ -109,15 +109,14 @@ class FiniteJ2Plasticity(Plasticity):
         for new, end, width in zip(self._new, point.end(), (6, 1), strict=True):
             new.reshape(-1, width)[own] = end.reshape(-1, width)
 
-    def stress(self, u: Any) -> Any:
-        """Return Cauchy's stress, 3×3, of the displacement that ``update`` was called for."""
+    def _stresses(self, u: Any) -> tuple[Any, Any]:
         F = ufl.Identity(3) + displacement_gradient(self.elasticity, u)
         J, P = ufl.det(F), self._tensor(self._P)
         tau = P * F.T
         if self.elasticity.model == "plane_strain":  # it is a deviator
             across = ufl.as_tensor([[0, 0, 0], [0, 0, 0], [0, 0, 1]])
             tau = tau - (tau[0, 0] + tau[1, 1]) * across
-        return self._in_volumes((tau + self._bulk * ufl.ln(J) * ufl.Identity(3)) / J)
+        return self._bulk * ufl.ln(J) / J * ufl.Identity(3), tau / J
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫P:∇v, whose derivative is that of the return."""

@@ -65,18 +65,17 @@ class Hyperelasticity(Material):
 
     def update(self) -> None:
         """Make the tangent of the residual that of where ``u`` is now."""
+        super().update()
         self._here.x.array[:] = self.u.x.array
 
     def deformation(self, u: Any) -> Any:
         """Return the deformation gradient F = I + ∇u, 3×3."""
         return ufl.Identity(3) + displacement_gradient(self.elasticity, u)
 
-    def stress(self, u: Any) -> Any:
-        """Return Cauchy's stress P Fᵀ/det F, 3×3."""
+    def _stresses(self, u: Any) -> tuple[Any, Any]:
         F = ufl.variable(self.deformation(u))
-        of_volume, of_shape = self.energies(F)
-        P = ufl.diff(of_volume + of_shape, F)
-        return self._in_volumes(P * F.T / ufl.det(F))
+        of_volume, of_shape = (ufl.diff(psi, F) * F.T / ufl.det(F) for psi in self.energies(F))
+        return of_volume, of_shape
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫P(u):∇v, P = ∂ψ/∂F, with a tangent that is definite on stretches."""

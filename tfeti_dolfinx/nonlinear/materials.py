@@ -203,10 +203,30 @@ class Material(ABC):
             self._inside.x.array[self._rows_of(self._inside)] = 1.0
         self._at = Quadrature.of(u, degree, selective, inside)
         self.dx = self._at.dx
+        # where it is selective: what resists a change of volume at the centre of each cell
+        self._centred: tuple[fem.Function, fem.Expression] | None = None
 
-    @abstractmethod
     def update(self) -> None:
         """Take ``u`` as it is now. Collective."""
+        if not self._at.selective:
+            return
+        if self._centred is None:
+            W = fem.functionspace(self._at.mesh, ("DG", 0, (3, 3)))
+            of_u = fem.Expression(self._stresses(self.u)[0], interpolation_points(W))
+            self._centred = fem.Function(W), of_u
+        function, of_u = self._centred
+        function.interpolate(of_u)
+
+    def stress(self, u: Any) -> Any:
+        """Return Cauchy's stress, 3×3, of the displacement that ``update`` was called for."""
+        of_volume, of_shape = self._stresses(u)
+        if self._centred is not None:
+            of_volume = self._centred[0]
+        return self._in_volumes(of_volume + of_shape)
+
+    @abstractmethod
+    def _stresses(self, u: Any) -> tuple[Any, Any]:
+        """Return the stress by which changes of volume are resisted, and the rest."""
 
     def _updated(self, V: fem.FunctionSpace, name: str | None = None) -> fem.Function:
         """Return a function that ``update`` sets, by which forms tell that they have the law."""
@@ -307,7 +327,7 @@ class Plasticity(Material):
             for name, value in self.given.items()
         }
         self._begin()
-        self.hardening()
+        self.update()
 
     @abstractmethod
     def _begin(self) -> None:
@@ -390,6 +410,7 @@ class J2Plasticity(Plasticity):
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""
+        super().update()
         self._q_and_G.interpolate(self._q_and_G_of_u)
         q, G = self._q_and_G.x.array.reshape(-1, 2)[self._rows].T.copy()
         hardening = self.hardening()
@@ -400,10 +421,9 @@ class J2Plasticity(Plasticity):
         self._dp.x.array[self._rows] = dp
         self._slope.x.array[self._rows] = slope
 
-    def stress(self, u: Any) -> Any:
-        """Return the stress, 3×3, of the displacement that ``update`` was called for."""
+    def _stresses(self, u: Any) -> tuple[Any, Any]:
         e = self.elasticity.strain(u)
-        return self._in_volumes(self._bulk * ufl.tr(e) * ufl.Identity(3) + self._deviator(u))
+        return self._bulk * ufl.tr(e) * ufl.Identity(3), self._deviator(u)
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫σ(u):ε(v)."""
