@@ -53,7 +53,7 @@ LAWS = {
     r"Tresca: bound is a \w+; expected a number, a function of points": law(
         lambda s: tfeti.Tresca(ufl.SpatialCoordinate(s.d.mesh)[0])
     ),
-    r"Tresca: bound has the shape \(2,\); expected a scalar function": law(
+    r"Tresca: bound has the shape \(2,\); expected a scalar": law(
         lambda s: tfeti.Tresca(fem.Function(s.V))
     ),
 }

@@ -27,7 +27,7 @@ from tfeti_dolfinx.mortar.facets import group_points
 from tfeti_dolfinx.mortar.segments import aligned
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
-Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function"
+Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function | fem.Constant"
 
 NOT_NEGATIVE = Range("a number, 0 or more", lambda value: value >= 0.0)
 
@@ -47,15 +47,14 @@ class FrictionLaw:
                 "expected one value, or two and the direction of the first"
             )
         for value in self.values:
-            if isinstance(value, fem.Function):
+            if isinstance(value, (fem.Function, fem.Constant)):
                 if value.ufl_shape != ():
-                    raise InputError(
-                        f"{what} has the shape {value.ufl_shape}; expected a scalar function"
-                    )
+                    raise InputError(f"{what} has the shape {value.ufl_shape}; expected a scalar")
             elif isinstance(value, ufl.core.expr.Expr):  # which can be called, with points
                 raise InputError(
                     f"{what} is {shown(value)}; expected a number, a function of points of shape "
-                    "(3, n), or a scalar dolfinx.fem.Function, into which UFL can be interpolated"
+                    "(3, n), a dolfinx.fem.Constant, or a scalar dolfinx.fem.Function, into which "
+                    "UFL can be interpolated"
                 )
             elif not callable(value):
                 checked_number(value, what, NOT_NEGATIVE)
@@ -85,9 +84,9 @@ class Tresca(FrictionLaw):
     whose normal displacement is prescribed.
 
     Args:
-        bound: A stress, 0 or more: a number, a function of points of shape ``(3, n)``, or a
-            scalar DOLFINx function on the torn mesh. Two of them: orthotropic, along the direction
-            and across it; the traction is in the ellipse with these semi-axes.
+        bound: A stress, 0 or more: a number, a function of points of shape ``(3, n)``, a DOLFINx
+            constant, or a scalar DOLFINx function on the torn mesh. Two of them: orthotropic, along
+            the direction and across it; the traction is in the ellipse with these semi-axes.
         direction: Vector along which the first of two bounds holds, projected on the surface.
 
     Raises:
@@ -114,9 +113,10 @@ class Coulomb(FrictionLaw):
     in what holds them.
 
     Args:
-        coefficient: 0 or more: a number, a function of points of shape ``(3, n)``, or a scalar
-            DOLFINx function on the torn mesh. Two of them: orthotropic, along the direction and
-            across it; the traction over the pressure is in the ellipse with these semi-axes.
+        coefficient: 0 or more: a number, a function of points of shape ``(3, n)``, a DOLFINx
+            constant, or a scalar DOLFINx function on the torn mesh. Two of them: orthotropic, along
+            the direction and across it; the traction over the pressure is in the ellipse with these
+            semi-axes.
         direction: Vector along which the first of two coefficients holds, projected on the
             surface.
 
@@ -194,6 +194,8 @@ def friction_values(
             on_nodes.interpolate(value)
             total = dofs.reduce(on_nodes.x.array[dof], np.add)
             value = (total / dofs.multiplicity)[records.group]
+        elif isinstance(value, fem.Constant):
+            value = value.value
         with raised_on_all_ranks(dofs.comm):
             columns.append(numbers_at(what, value, x, lowest=0.0))
     if len(columns) < dofs.bs - 1:
