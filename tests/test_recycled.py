@@ -116,10 +116,10 @@ def program(spread):
 
 
 def solved(qp, directions, target, most=1000):
-    steps, point = Steps(), Point(np.zeros(n), -qp.d)
-    target *= np.linalg.norm(point.g)
-    reason = pcpg(qp, point, StoppingRule(target), steps, most, directions=directions)
-    return reason, steps.cg, point.lam
+    steps, rule = Steps(), StoppingRule(target * np.linalg.norm(qp.d))
+    start = Point(np.zeros(n), -qp.d)
+    end, reason = pcpg(qp, start, rule, steps, most, directions=directions)
+    return reason, steps.cg, end.lam
 
 
 @pytest.mark.parametrize(("spread", "times"), [(1e2, 1.0), (1e6, 1.1), (1e8, 3.0)])

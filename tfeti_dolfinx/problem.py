@@ -513,7 +513,7 @@ class ContactProblem:
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
         if dual.constraints is not start[0].constraints:
             return state
-        state = replace(state, image=dual.last.known(self.dofs.comm, start[1]))
+        state = replace(state, image=dual.last.multiple(self.dofs.comm, start[1]))
         kept = dual.recycled
         return state if kept is None else replace(state, directions=kept.in_order())
 
@@ -546,7 +546,7 @@ class ContactProblem:
         dual.learn()
         if dual.recycled is not None:
             dual.recycled.take(state.directions)
-        dual.last.take(self.dofs.comm, state.lam, state.image)
+        dual.know(state.lam, state.image)
         # a face that only knows what rows do
         face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
         solution = self._make_solution(state.u, Multipliers(state.lam, face), gluing)

@@ -27,7 +27,7 @@ from tfeti_dolfinx.feti.projectors import FaceFactors
 from tfeti_dolfinx.feti.rigid_bodies import Motions, free_to_move, listed
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
-from tfeti_dolfinx.qp.problem import QP, FaceOperator, LastProduct, Operator
+from tfeti_dolfinx.qp.problem import QP, FaceOperator, KnownProduct, Operator
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, FeasibleSet, Product, Status
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
@@ -109,7 +109,8 @@ class Dual:
         feasible: The set Ω of multipliers.
         pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
-        last: The last solution of block Newton, or without a kernel, with its image.
+        last: The last solution of block Newton, or without a kernel, with its image; ``solved`` are
+            d and e of its program.
         recycled: Directions of earlier solves; None: none are kept.
         begin: Where the load step began, shape ``(n,)``; bodies that nothing holds stay near.
         negligible: Displacements of bodies that count as none, shape ``(bodies,)``.
@@ -179,7 +180,8 @@ class Dual:
         self.contact_rows = constraints.contact_rows
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
-        self.seen, self.last = 0.0, LastProduct()
+        self.seen, self.last = 0.0, KnownProduct()
+        self.solved: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self.begin: Array | float = 0.0
         self.negligible: Array | float = 0.0
         self.recycled: Recycled | None = None
@@ -382,10 +384,15 @@ class Dual:
         if 0.0 < norm_over(comm, lam) <= LIMITS.far * norm_over(comm, least):
             return False
         known = coarse.combined(mu) if len(mu) == coarse.dimension else least
-        Fx = self.last.image(self.F, comm, lam).Fx
-        self.last.x, self.last.Fx, self.last.within = lam, Fx, 0.0
+        Fx = self.last.image(self.F, comm, lam)
+        self.last = KnownProduct(lam, Fx)
         lengths = norm_over(comm, known) + norm_over(comm, Fx)
         return lengths > LIMITS.far * norm_over(comm, self.driving)
+
+    def know(self, lam: Array, image: Array) -> None:
+        """Take Fλ of another run, if some rank has it. Collective."""
+        if any_rank(self.coarse.comm, image.size > 0):
+            self.last = KnownProduct(lam, image)
 
     def nearly_free(self, loose: Motions) -> list[dict[str, Any]]:
         """List motions of those that contact rows hold hardly or not, see ``listed``."""

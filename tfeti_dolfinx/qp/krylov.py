@@ -11,7 +11,6 @@ from tfeti_dolfinx.qp.problem import (
     QP,
     STRANGE,
     ConvergedReason,
-    Homogenised,
     Monitor,
     Operator,
     Point,
@@ -120,14 +119,14 @@ def pcpg(
     max_it: int,
     monitor: Monitor = no_monitor,
     directions: Directions | None = None,
-) -> ConvergedReason:
-    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a point on and in place. Collective.
+) -> tuple[Point, ConvergedReason]:
+    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a point on. Collective.
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone; the feasible set is kept by
     nobody. Multiplies by F, and by the preconditioner, once per step. A step makes three global
     reductions: one with each projection, one for the norm of the residual; one more where there are
-    directions of earlier solves.
+    directions of earlier solves. Return the end, and why it is one.
 
     ===========================  ===================================================
     reason                       when
@@ -141,7 +140,7 @@ def pcpg(
     left.
     """
     own, comm = Directions(qp) if directions is None else directions, qp.coarse.comm
-    recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
+    recycled, (point, past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
     least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
     while True:
@@ -149,8 +148,8 @@ def pcpg(
         small = norm <= rule.tolerance
         reason = _examined(qp, point, rule, norm) if small else ConvergedReason.ITERATING
         if small and reason == ConvergedReason.ITERATING and qp.rough is not None:
-            point.g = point.g if rule.gradient is None else rule.gradient
-            past, norm = _begun(qp, point, own)
+            point = point if rule.gradient is None else Point(point.lam, rule.gradient)
+            point, past, norm = _begun(qp, point, own)
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -181,7 +180,7 @@ def pcpg(
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
-        point.lam, point.g = point.lam + rp / pFp * p, point.g + rp / pFp * Fp
+        point = Point(point.lam + rp / pFp * p, point.g + rp / pFp * Fp)
         kept.put(p / np.sqrt(pFp), PFp / np.sqrt(pFp))
         if recycled is not None:
             new = [*new[1 - recycled.capacity :], (p, Fp, pFp)]
@@ -193,23 +192,22 @@ def pcpg(
         monitor(steps, "cg", point.lam, norm, 0.0)
     for direction in new:
         recycled.add(*direction)  # type: ignore[union-attr]
-    return reason
+    return point, reason
 
 
 def solve_by_pcpg(
     qp: QP,
-    homogenised: Homogenised,
+    start: Start,
     rule: StoppingRule,
     parameters: PcpgParameters = DEFAULT,
     *,
     max_it: int = 10_000,
-    start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
     """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
 
     Stops as ``pcpg`` does; with ``DIVERGED_ROUNDING`` where residuals are rounding, too, and a
-    direction has no positive curvature. Inequalities are not looked at, nor is ``start`` beside λ̄.
+    direction has no positive curvature. Inequalities are not looked at, nor is an earlier λ.
 
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
@@ -221,12 +219,12 @@ def solve_by_pcpg(
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
     """
-    point, steps = Point(homogenised.lam_bar, homogenised.gradient), Steps()
-    monitor(steps, "start", point.lam, norm_over(qp.coarse.comm, homogenised.b), 0.0)
-    reason = pcpg(qp, point, rule, steps, max_it, monitor)
+    steps = Steps()
+    monitor(steps, "start", start.at.lam, norm_over(qp.coarse.comm, start.b), 0.0)
+    point, reason = pcpg(qp, start.at, rule, steps, max_it, monitor)
     g = qp.coarse.project(point.g)
     norm = norm_over(qp.coarse.comm, g)
-    rounds = norm <= STRANGE * homogenised.rounding
+    rounds = norm <= STRANGE * start.rounding
     if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and rounds:
         reason = ConvergedReason.DIVERGED_ROUNDING
     return QPResult(
@@ -236,8 +234,8 @@ def solve_by_pcpg(
         face=qp.feasible.face(point.lam, g),
         reason=reason,
         projected_gradient=norm,
-        equality=qp.coarse.norm_Q(point.lam - homogenised.lam_bar),
-        reference=homogenised.reference,
+        equality=qp.coarse.norm_Q(point.lam - start.at.lam),
+        reference=start.reference,
         norm=0.0,
         steps=steps,
     )
@@ -249,8 +247,8 @@ def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> Converge
     return rule.examine(point.lam, point.g, face, norm, qp.norm)
 
 
-def _begun(qp: QP, point: Point, own: Directions) -> tuple[Along | None, float]:
-    """Minimise q over directions of earlier solves; return steps along them, and ‖r‖, r = −P g.
+def _begun(qp: QP, point: Point, own: Directions) -> tuple[Point, Along | None, float]:
+    """Minimise q over directions of earlier solves; return where, steps along them, and ‖P g‖.
 
     Projected twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
     """
@@ -259,6 +257,6 @@ def _begun(qp: QP, point: Point, own: Directions) -> tuple[Along | None, float]:
     if qp.recycled is not None and (past := qp.recycled.on_face(qp.held)) is not None:
         way, b = past(own.r, qp.recycled.directions)
         # rounding of many directions is none of Gλ = e
-        point.lam, point.g = point.lam + project(way), point.g + qp.recycled.images.T @ b
+        point = Point(point.lam + project(way), point.g + qp.recycled.images.T @ b)
         own.fresh, own.r = True, project(project(-point.g))
-    return past, norm_over(qp.coarse.comm, own.r)
+    return point, past, norm_over(qp.coarse.comm, own.r)

@@ -14,7 +14,6 @@ from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
-    Homogenised,
     Monitor,
     Point,
     QPResult,
@@ -128,7 +127,7 @@ def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1, roughly: float 
     return project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count), alpha)[0]
 
 
-def feasible_start(qp: QP, start: Start) -> Array:
+def feasible_start(qp: QP, lam: Array) -> Array:
     """Step 0: the nearest feasible point to earlier multipliers, or the first. Collective.
 
     What was open stays open, if the others can restore Gλ = e: else each would carry a little.
@@ -136,8 +135,7 @@ def feasible_start(qp: QP, start: Start) -> Array:
     has so many kinks that the projection may end before. Where a load grows, cλ, whose image is
     known, is in its place if it is feasible and about as near to λ.
     """
-    lam, coarse = start.lam, qp.coarse
-    on = qp.feasible.project(lam)
+    coarse, on = qp.coarse, qp.feasible.project(lam)
     for within in (WithinFace(qp.feasible, qp.feasible.face(on, -on)), qp.feasible):
         found, _ = project_onto_feasible(coarse, within, lam)
         if imbalance(coarse, found) <= UNBALANCED:
@@ -482,9 +480,9 @@ class FaceSolver:
         qp, given = self._qp, self._parameters
         exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
         program = replace(self._on_face, F=qp.F, rough=None, d=Fw, recycled=None)
-        point, own = Point(np.zeros(len(way)), -Fw), Directions(replace(qp, keeps=True))
-        pcpg(program, point, StoppingRule(exact), Steps(), given.purifying, directions=own)
-        return way - point.lam, -point.g
+        zero, own = Point(np.zeros(len(way)), -Fw), Directions(replace(qp, keeps=True))
+        end, _ = pcpg(program, zero, StoppingRule(exact), Steps(), given.purifying, directions=own)
+        return way - end.lam, -end.g
 
     def _pcpg(self, z: Point, optimality: float, resume: bool) -> tuple[Point, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
@@ -497,11 +495,11 @@ class FaceSolver:
         target = share * min(norm_over(qp.coarse.comm, self.coarse.project(z.g)), optimality)
         lowest = 0.0 if self._rule.waits else given.final * self._rule.tolerance
         rule = StoppingRule(max(target, lowest))
-        end, norm = Point(z.lam, z.g), own.norm
-        reason = pcpg(self._on_face, end, rule, self._steps, self._max_it, self._monitor, own)
+        norm = own.norm
+        end, reason = pcpg(self._on_face, z, rule, self._steps, self._max_it, self._monitor, own)
         self.left = norm_over(qp.coarse.comm, own.r)
         if self._curved:
-            end.g = end.g - face.bend(end.lam - z.lam)
+            end = Point(end.lam, end.g - face.bend(end.lam - z.lam))
             own.norm = norm  # small circles bend far more than F does
         return end, reason != ConvergedReason.CONVERGED_RTOL and self._steps.cg < self._max_it
 
@@ -511,12 +509,11 @@ class FaceSolver:
 
 def newton(
     qp: QP,
-    homogenised: Homogenised,
+    start: Start,
     rule: StoppingRule,
     parameters: NewtonParameters = NewtonParameters(),
     *,
     max_it: int = 10_000,
-    start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
     """Minimise q(λ) = ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω. Collective.
@@ -524,7 +521,7 @@ def newton(
     Iterates are feasible, and q falls in each step. A step solves on a face of Ω by PCPG, drops
     what leaves Ω, all at once, and solves again on the smaller face. The numbers of the steps are
     those of docs/theory.md; docs/developers/implementation.md has a diagram. It begins at λ̄, which
-    is feasible, with the μ of ``start``.
+    is feasible, with the earlier μ.
 
     ===========================  =================================================================
     reason                       when
@@ -539,31 +536,29 @@ def newton(
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise, operator_product
+    >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
-    >>> start = homogenise(qp, operator_product(F, qp.coarse.comm, first_point(qp)))
-    >>> result = newton(qp, start, StoppingRule(1e-10))
+    >>> result = newton(qp, homogenise(qp, first_point(qp)), StoppingRule(1e-10))
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
     """
     steps = Steps()
     solver = FaceSolver(qp, rule, parameters, steps, max_it, monitor)
     # Step 0: a feasible start
-    z = Point(homogenised.lam_bar, homogenised.gradient)
-    mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
+    z, mu = start.at, np.zeros(qp.coarse.dimension) if start.lam is None else start.mu
     if mu is None:
         mu = multipliers_at(qp, z, unfelt=parameters.unfelt)
     state = NewtonIteration(qp, solver, parameters, z, mu)
-    monitor(steps, "start", homogenised.lam_bar, norm_over(qp.coarse.comm, homogenised.b), 0.0)
+    monitor(steps, "start", z.lam, norm_over(qp.coarse.comm, start.b), 0.0)
     friction = any_rank(qp.coarse.comm, state.pressed.status >= RUBS)
     reason = ConvergedReason.ITERATING
-    if friction and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
+    if friction and imbalance(qp.coarse, z.lam) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before
         reason = ConvergedReason.DIVERGED_STALLED
         state.look()
     # without friction and an earlier λ the first solve is on the face of the start, as it shows ‖F‖
-    looks = start is not None or friction
+    looks = start.lam is not None or friction
     while reason == ConvergedReason.ITERATING:
         first, face = state.z, state.pressed
         if looks:
@@ -592,8 +587,8 @@ def newton(
         face=state.pressed,
         reason=reason,
         projected_gradient=state.residual,
-        equality=qp.coarse.norm_Q(state.z.lam - homogenised.lam_bar),
-        reference=homogenised.reference,
+        equality=qp.coarse.norm_Q(state.z.lam - start.at.lam),
+        reference=start.reference,
         norm=solver.directions.norm,
         steps=steps,
         excluding=np.empty(0, np.int64) if solver.excluding is None else solver.excluding,
