@@ -33,9 +33,8 @@ def test_random_programs(seed, k, isotropic):
     F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
     feasible = as_set(bounded, pairs, a, isotropic)
     qp = QP(matrix(F), vector(d), DenseCoarse(G, e), feasible)
-    qp = replace(qp, norm=estimate_norm(qp.F, qp.coarse, 60))
-    start = homogenise(qp)
-    slow = smalse(qp, start, to(1e-10, start), max_it=20_000)
+    start, norm = homogenise(qp), estimate_norm(qp.F, qp.coarse, 60)
+    slow = smalse(replace(qp, norm=norm), start, to(1e-10, start), max_it=20_000)
     for result in (solved(qp, 1e-10 * np.linalg.norm(d)), slow):
         assert result.reason == ConvergedReason.CONVERGED_RTOL
         lam = result.lam
@@ -84,7 +83,7 @@ def test_from_its_own_solution_it_multiplies_once():
     F = Counted(matrix(F))
     qp = QP(F, vector(d), DenseCoarse(G, e), as_set(bounded, pairs, a, True))
     found, before = solved(qp, 1e-10), F.count
-    again = solved(replace(qp, seen=found.norm), 1e-8, lam=found.lam, mu=found.mu)
+    again = solved(replace(qp, norm=found.norm), 1e-8, lam=found.lam, mu=found.mu)
     assert again.steps.cg == again.steps.outer == 0
     assert F.count == before + 1
     assert np.allclose(again.lam, found.lam, atol=1e-9)

@@ -1,7 +1,5 @@
 """Directions of earlier solves: what they save, and that they stay right."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from test_repeated import Repeated, distance
@@ -131,7 +129,7 @@ def test_hardly_more_steps_than_dimensions(spread, times):
     assert steps <= times * n
     error = found - known
     assert error @ F @ error <= 1e-10 * (known @ F @ known)
-    _, more, _ = solved(qp, Directions(replace(qp, keeps=False)), 1e-9, 5000)
+    _, more, _ = solved(qp, Directions(qp, keeps=False), 1e-9, 5000)
     assert more >= (steps if spread < 1e6 else 4 * steps)
 
 

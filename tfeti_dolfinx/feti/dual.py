@@ -289,14 +289,13 @@ class Dual:
     def qp(self, norm_steps: int = 0) -> QP:
         """Return the quadratic program; without kernel it has no coarse problem.
 
-        ‖PFP‖ is estimated once, by so many Lanczos steps; 0 where nobody asks for it.
+        ‖PFP‖ is estimated once, by so many Lanczos steps; 0: not at all.
         """
         self.feasible = self.law(self.constraints)  # c may be another, and what the law refers to
         if norm_steps and norm_steps not in self._norms:
             before = self.F.count
             self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)
             self.norm_count, self.F.count = self.F.count - before, before
-        norm = self._norms.get(norm_steps, 1.0)
         on = self._preconditioner_on if self.preconditioner is not None else None
         return QP(
             self.F,
@@ -304,12 +303,9 @@ class Dual:
             self.coarse,
             self.feasible,
             preconditioner=self._on_all_rows,
-            norm=norm,
+            norm=self._norms.get(norm_steps, self.seen),
             preconditioner_on=on,
-            seen=self.seen,
             recycled=self.recycled,
-            keeps="kept_directions" not in self._without,
-            cautious="cautious" not in self._without,
             sprung=self.subdomains.num_springs > 0,
             rough=self.rough,
             foundation=None if "foundation" in self._without else self.foundation,

@@ -71,6 +71,8 @@ class PcpgParameters:
     # gradients begin anew
     drifted: float = 0.5
     short: float = 1e-6  # of λ: a way that is shorter may be rounding of Gλ = e
+    # whether a direction is made conjugate to all before it, not to the last alone
+    keeps: bool = True
 
 
 DEFAULT = PcpgParameters()
@@ -91,11 +93,11 @@ class Directions:
         helped: Largest rᵀz/rᵀr so far.
     """
 
-    def __init__(self, qp: QP) -> None:
+    def __init__(self, qp: QP, keeps: bool = True) -> None:
         self.r, self.p = np.zeros(len(qp.d)), np.zeros(len(qp.d))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
         rows = int(largest(qp.coarse.comm, np.array([len(qp.d)])))
-        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if qp.keeps else 1
+        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
@@ -221,7 +223,8 @@ def solve_by_pcpg(
     """
     steps = Steps()
     monitor(steps, "start", start.at.lam, norm_over(qp.coarse.comm, start.b), 0.0)
-    point, reason = pcpg(qp, start.at, rule, steps, max_it, monitor)
+    directions = Directions(qp, parameters.keeps)
+    point, reason = pcpg(qp, start.at, rule, steps, max_it, monitor, directions)
     g = qp.coarse.project(point.g)
     norm = norm_over(qp.coarse.comm, g)
     rounds = norm <= STRANGE * start.rounding
@@ -252,9 +255,11 @@ def _begun(qp: QP, point: Point, own: Directions) -> tuple[Point, Along | None, 
 
     Projected twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
     """
-    project, past = qp.coarse.project, None
+    project, face, past = qp.coarse.project, qp.coarse.face, None
     own.r = project(project(-point.g))
-    if qp.recycled is not None and (past := qp.recycled.on_face(qp.held)) is not None:
+    if qp.recycled is not None:
+        past = qp.recycled.on_face(None if face is None else face.held)
+    if past is not None and qp.recycled is not None:
         way, b = past(own.r, qp.recycled.directions)
         # rounding of many directions is none of Gλ = e
         point = Point(point.lam + project(way), point.g + qp.recycled.images.T @ b)

@@ -75,6 +75,10 @@ class NewtonParameters:
     far: float = 1e30  # how far such a direction is followed, to end in Ω's cone of recession
     unseen: float = 1e-14  # of ‖F‖‖w‖: what may be left of Fw where F is not to see a direction w
     purifying: int = 200  # most steps of PCPG to that
+    # whether rows leave a face one by one after a step in which all together have raised q, or
+    # two in which what was left did not balance the load
+    cautious: bool = True
+    keeps: bool = True  # that of PCPG
 
 
 # --- Step 0: start ----------------------------------------------------------------------------
@@ -294,7 +298,8 @@ class NewtonIteration:
         self.resume = taken
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
         unbalanced, self.unbalanced = self.unbalanced and not feasible, not feasible
-        self.solver.cautious = self.qp.cautious and (unbalanced or (rose and self.idle < 2))
+        early = unbalanced or (rose and self.idle < 2)
+        self.solver.cautious = self.parameters.cautious and early
         if taken:
             self._go(end, 0.5 * double)
         if not taken and not looked:
@@ -350,8 +355,8 @@ class FaceSolver:
     ) -> None:
         self._qp, self._rule, self._parameters = qp, rule, parameters
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
-        self.directions = Directions(qp)
-        self.directions.norm = qp.seen
+        self.directions = Directions(qp, parameters.keeps)
+        self.directions.norm = qp.norm
         self._face: Face | None = None
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
         self._status, self.cautious, self.rounds = np.zeros(len(qp.d)), False, 0
@@ -407,7 +412,7 @@ class FaceSolver:
         self._face, self._status = face, face.status
         self._curved = any_rank(qp.coarse.comm, slips)
         self.coarse = qp.coarse.on_face(face)
-        self._on_face = replace(qp, coarse=self.coarse, held=face.held, preconditioner=None)
+        self._on_face = replace(qp, coarse=self.coarse, preconditioner=None)
         if self._curved:
             F, bend = qp.roughly, face.bend
             self._on_face = replace(
@@ -480,7 +485,7 @@ class FaceSolver:
         qp, given = self._qp, self._parameters
         exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
         program = replace(self._on_face, F=qp.F, rough=None, d=Fw, recycled=None)
-        zero, own = Point(np.zeros(len(way)), -Fw), Directions(replace(qp, keeps=True))
+        zero, own = Point(np.zeros(len(way)), -Fw), Directions(qp)
         end, _ = pcpg(program, zero, StoppingRule(exact), Steps(), given.purifying, directions=own)
         return way - end.lam, -end.g
 

@@ -51,21 +51,14 @@ class QP:
     coarse: Coarse  # projectors of G, and a particular solution of Gλ = e
     feasible: FeasibleSet  # the set Ω
     preconditioner: Operator | None = None  # approximate inverse of F, or None
-    norm: float = 1.0  # estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks
+    # estimate of ‖PFP‖ for solvers whose step lengths are relative to it; for others the largest
+    # Rayleigh quotient of F that earlier solves have seen; 0 if there were none
+    norm: float = 0.0
     # gives an approximate inverse of ZᵀFZ for a face Z, between vectors of the face in the layout
     # of all rows, until it is asked for another; or None
     preconditioner_on: Callable[[Face], Operator] | None = None
-    # largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none
-    seen: float = 0.0
     # directions of earlier solves, which those of PCPG are made F-orthogonal to
     recycled: Recycled | None = None
-    # flags of the local rows that are 0 on the face of `coarse`; None: of no face
-    held: Array | None = None
-    # whether a direction of PCPG is made conjugate to all before it, not the last alone
-    keeps: bool = True
-    # whether rows leave a face one by one after a step in which all together have raised q, or
-    # two in which what was left did not balance the load
-    cautious: bool = True
     # forces of a rank's rows if each were a spring that its gap presses, as stiff as bodies are
     # where so many rows carry together; None: unknown
     foundation: Callable[[int], Array] | None = None

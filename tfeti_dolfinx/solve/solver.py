@@ -77,7 +77,15 @@ def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
     friction = options.friction_type
     if friction == "auto":
         friction = "newton" if qp_type == "newton" else "fixed_point"
-    return replace(options, qp_type=qp_type, pc_type=pc_type, friction_type=friction)
+    keeps, cautious = (name not in options.without for name in ("kept_directions", "cautious"))
+    return replace(
+        options,
+        qp_type=qp_type,
+        pc_type=pc_type,
+        friction_type=friction,
+        pcpg=replace(options.pcpg, keeps=keeps),
+        newton=replace(options.newton, keeps=keeps, cautious=cautious),
+    )
 
 
 def solve_dual(
@@ -116,7 +124,7 @@ def solve_dual(
         monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
     rtol = options.number if rtol is None else rtol
     rule = make_rule(dual, rtol, options.atol, (begin.reference, begin.rounding), goal)
-    own, most = getattr(options, qp_type, solver.parameters), options.max_it
+    own, most = getattr(options, qp_type), options.max_it
     result = solver.solve(qp, begin, rule, own, max_it=most, monitor=monitor or no_monitor)
     rounding = result.reason == ConvergedReason.DIVERGED_ROUNDING
     if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
