@@ -318,7 +318,7 @@ class ContactProblem:
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
         contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
         excluding = system.search.named(contacts)
-        loose = dual.nearly_free(state.loose) if options.warnings else []
+        loose = dual.coarse.nearly_free(state.loose) if options.warnings else []
         self._rounding = accuracy.allowed.rounding
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, loose)
         warnings = list[str]()

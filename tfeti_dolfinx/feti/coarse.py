@@ -1,5 +1,6 @@
 """The natural coarse space: G = Rᵀ Bᵀ, its projectors, and motions that no row of B resists."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -14,6 +15,7 @@ from tfeti_dolfinx.common.parallel import (
     chunk_offsets,
     joined_over,
 )
+from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
     FaceFactors,
@@ -41,11 +43,12 @@ class CoarseSpace(Coarse):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
 
     G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
-    ``bounded`` are local rows with λ ≥ 0, ``rubbing`` those of friction, ``springs`` those of
-    springs, behind all others: √(D/σ) PᵀR of these, so that F is 1/σ there. Creation and all
-    methods but ``spring_ends`` are collective.
+    Rows of springs are √(D/σ) PᵀR, so that F is 1/σ there. Creation and all methods but
+    ``spring_ends`` are collective. ``names`` are those of bodies and of their modes.
 
     Attributes:
+        bounded: Local rows with λ ≥ 0, ``rubbing`` those of friction, ``springs`` those of springs,
+            behind all others.
         dimension: r, the dimension of the kernel of K.
         e: (R T)ᵀ f, shape ``(r,)``; 0 instead of rounding where only contact holds a body.
         motions: The bodies' motions in the basis T; ``work`` is the product of their transpose with
@@ -65,22 +68,22 @@ class CoarseSpace(Coarse):
 
     def __init__(
         self,
-        B: PETSc.Mat,
+        constraints: Constraints,
         subdomains: Subdomains,
-        bounded: Array,
-        rubbing: Array,
-        springs: Array,
-        sigma: float,
+        names: tuple[Sequence[str], Sequence[str]],
+        sigma: float = 1.0,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.subdomains, self.bounded, self.rubbing = subdomains, bounded, rubbing
-        self.comm = comm = subdomains.comm
+        B, sets = constraints.B, constraints.sets
+        self.subdomains, self.comm, self.sigma = subdomains, subdomains.comm, sigma
+        self.bounded, self.rubbing = sets.normals, sets.tangents.ravel()
+        comm, springs = self.comm, sets.springs if subdomains.num_springs else sets.springs[:0]
         kernel = subdomains.kernel_rows
         offsets = chunk_offsets(comm, kernel.shape[1])
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         Gt = transposed_G(B, kernel, dimension)
-        self.springs, self.sigma = springs, sigma
+        self.springs = springs
         indptr, _, data = B.getValuesCSR()
         row = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
         sizes = np.bincount(row, np.abs(data), minlength=len(indptr) - 1).astype(float)
@@ -92,18 +95,18 @@ class CoarseSpace(Coarse):
             )
             sizes[springs] = np.sqrt(own.power(2).sum(axis=1))
         self.row_size = np.where(sizes > 0.0, sizes, 1.0)
-        self.bodies = Bodies(subdomains)
+        self.bodies = Bodies(subdomains, *names)
         self.J = self._on_bodies(Gt)
         equalities = np.ones(len(self.row_size), dtype=bool)
-        equalities[np.concatenate((bounded, rubbing))] = False
+        equalities[sets.contact] = False
         self.unheld = self._unglued = self.unresisted(equalities, self.bodies.unsprung)
         glues = np.array(equalities)
         glues[springs] = False
         if subdomains.num_springs:
             self._unglued = self.unresisted(glues, self.bodies.unsprung)
         # contact does not hold bodies that move as one; nor do its rows then in G
-        J = self.J
-        if self.bodies.count > 1 and self.unheld.free.any() and any_rank(comm, len(rubbing) > 0):
+        J, several = self.J, self.bodies.count > 1 and self.unheld.free.any()
+        if several and any_rank(comm, len(self.rubbing) > 0):
             self.J = J.without(self.bodies.as_one(self.unheld))
         self.free_motions = self.unresisted(~equalities)
         self.J = J.without(self.free_motions.joint)
@@ -215,6 +218,13 @@ class CoarseSpace(Coarse):
             return np.empty(0, dtype=np.int64)
         moved = np.any(motion.reshape(self.bodies.count, -1), axis=1)
         return self.J.row[moved[self.J.body]]
+
+    def nearly_free(self, loose: Motions) -> list[dict[str, Any]]:
+        """List motions of those that contact rows hold hardly or not, see ``Bodies.listed``."""
+        if not self.unheld.free.any():  # conditions hold all bodies: contact need not
+            return []
+        hardly = replace(loose, free=loose.stiffness <= TOLERANCES.nearly)
+        return bcast_from_root(self.comm, self.bodies.listed(hardly))
 
     def unresisted(self, rows: Array, within: Motions | None = None) -> Motions:
         """Return motions of a space that rows do not resist.

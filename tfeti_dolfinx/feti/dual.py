@@ -1,15 +1,15 @@
 """The dual problem of a scene: Blocks and rows in, a quadratic program out."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, norm_over
+from tfeti_dolfinx.common.parallel import any_rank, largest, norm_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
@@ -24,7 +24,6 @@ from tfeti_dolfinx.feti.operator import (
 )
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.projectors import FaceFactors
-from tfeti_dolfinx.feti.rigid_bodies import Motions, free_to_move, listed
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, KnownProduct, Operator
@@ -44,9 +43,6 @@ class DualLimits:
     # of stiffness, lengths and forces: below it squares leave the range of floating point
     least: float = 1e-130
     most: float = 1e130  # the same above
-    # motions held by less than this share of what the same contacts hold at most are nearly free:
-    # their contacts' normals are off by less than 6 degrees from a right angle
-    nearly: float = 1e-2
     parallel: float = 1e-12  # loads whose directions differ by less are held by the same contacts
     # directions kept where options do not say how many: later ones gain hardly anything, and each
     # takes two vectors
@@ -136,7 +132,6 @@ class Dual:
         self._given = constraints
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
         self._prefix = f"{options_prefix}face_"
-        self._names = body_names, mode_names
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self._stiffness = largest(comm, subdomains.diagonal)
         self._set_linear_term(comm)
@@ -161,19 +156,16 @@ class Dual:
         self._on_all: FaceOperator | None = None
         self._on_last: tuple[Face, FaceOperator] | None = None
         self._held_load: Array | None = None
-        normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
-        prefix = f"{options_prefix}coarse_"
-        springs, sigma = constraints.sets.springs, 1.0
-        if not subdomains.num_springs:
-            springs = springs[:0]
-        else:
+        prefix, sigma = f"{options_prefix}coarse_", 1.0
+        if subdomains.num_springs:
             sigma = mean_stiffness(subdomains, constraints.weights)
             on_springs: Array = np.zeros(constraints.num_rows)
-            on_springs[springs] = 1.0
+            on_springs[constraints.sets.springs] = 1.0
             self.F.added = on_springs / sigma
             if self.preconditioner is not None:
                 self.preconditioner.added = sigma * on_springs
-        self.coarse = CoarseSpace(B, subdomains, normals, tangents, springs, sigma, prefix)
+        names = body_names, mode_names
+        self.coarse = CoarseSpace(constraints, subdomains, names, sigma, prefix)
         self.deflation: Deflation | None = None
         if self.preconditioner is not None and deflation is not None:
             self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
@@ -212,7 +204,7 @@ class Dual:
             if not any_rank(comm, apart > LIMITS.parallel * size):
                 return
         self._held_load = None  # what holds a load holds its multiples, but for given limits
-        check_solvable(coarse, self._given, self.pulling, load, *self._names)
+        check_solvable(coarse, self._given, self.pulling, load)
         limited = len(self._given.pressed) < len(self._given.sets.tangents)
         if not any_rank(comm, limited or size == 0.0):
             self._held_load = load / size
@@ -389,34 +381,6 @@ class Dual:
         """Take Fλ of another run, if some rank has it. Collective."""
         if any_rank(self.coarse.comm, image.size > 0):
             self.last = KnownProduct(lam, image)
-
-    def nearly_free(self, loose: Motions) -> list[dict[str, Any]]:
-        """List motions of those that contact rows hold hardly or not, see ``listed``."""
-        if not self.coarse.unheld.free.any():  # conditions hold all bodies: contact need not
-            return []
-        hardly = replace(loose, free=loose.stiffness <= LIMITS.nearly)
-        return bcast_from_root(self.coarse.comm, listed(hardly, self.coarse.bodies, *self._names))
-
-    def sliding(self, motion: Array) -> tuple[str, Array]:
-        """Return a sentence on a motion of bodies, and local rows of friction that slip most."""
-        coarse, slip = self.coarse, np.zeros(len(self.d))
-        slip[coarse.rubbing] = np.abs(coarse.J @ motion)[coarse.rubbing]
-        most = np.flatnonzero(slip > 0.5 * largest(coarse.comm, slip))
-        return free_to_move(coarse.bodies.amounts(motion), *self._names), most
-
-    def moves_rigidly(self, u: Array, bends: float) -> str:
-        """Return a sentence on the bodies that move most, but for less than a share bends, or "".
-
-        Collective; u on all unknowns.
-        """
-        subdomains, bodies = self.subdomains, self.coarse.bodies
-        amounts = bodies.amounts(bodies.part_of(u))
-        sizes = subdomains.body_sizes([u, u - subdomains.modes_motion(amounts)])
-        moved, bent = bcast_from_root(subdomains.comm, sizes)
-        rigid = (bent <= bends * moved) & (moved >= 0.5 * moved.max(initial=0.0))
-        if not np.any(rigid):
-            return ""
-        return free_to_move(np.where(rigid[:, None], amounts, 0.0), *self._names)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

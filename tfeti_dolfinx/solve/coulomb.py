@@ -173,9 +173,11 @@ def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, 
             motion = coarse.bodies.part_of(state.u)
     if motion is None:
         return ""
+    slips = np.zeros(len(dual.d))
+    slips[coarse.rubbing] = np.abs(coarse.J @ motion)[coarse.rubbing]
     result.reason = ConvergedReason.DIVERGED_FRICTION
-    words, result.excluding = dual.sliding(motion)
-    return words
+    result.excluding = np.flatnonzero(slips > 0.5 * largest(coarse.comm, slips))
+    return coarse.bodies.sentence(coarse.bodies.amounts(motion))
 
 
 class FrictionBounds:
