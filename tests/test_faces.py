@@ -11,10 +11,10 @@ from test_solvability import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.parallel import dot_over, norm_over
-from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.sets import Face, Product, Status
+from tfeti_dolfinx.testing import DenseCoarse
 
 
 def in_a_corner(**options):

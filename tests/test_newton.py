@@ -11,13 +11,14 @@ from test_newton_discs import solved
 from test_qp import bounds_on, matrix, vector
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.qp.coarse import DenseCoarse, imbalance
+from tfeti_dolfinx.qp.coarse import imbalance
 from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import first_point, newton
 from tfeti_dolfinx.qp.problem import QP, StoppingRule, homogenise
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Product
+from tfeti_dolfinx.testing import DenseCoarse
 
 
 def program(seed, kind="regular"):

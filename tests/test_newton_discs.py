@@ -11,13 +11,13 @@ from test_discs import discs
 from test_mpgp import around_circles, as_set, program
 from test_qp import Counted, matrix, to, vector
 
-from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, StoppingRule, homogenise, no_monitor
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import Status
 from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.testing import DenseCoarse
 
 
 def solved(qp, tolerance, monitor=no_monitor, lam=None, mu=None):

@@ -11,12 +11,12 @@ from reference.untorn import check_optimal
 from scipy.sparse import diags_array
 
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
+from tfeti_dolfinx.testing import DenseCoarse
 
 SELF = MPI.COMM_SELF
 

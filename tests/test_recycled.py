@@ -5,11 +5,11 @@ import pytest
 from test_repeated import Repeated, distance
 
 from tfeti_dolfinx.common.parallel import norm_over
-from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.recycling import DirectionStore, right_singular
 from tfeti_dolfinx.qp.sets import Product
+from tfeti_dolfinx.testing import DenseCoarse
 
 
 def images(problem):

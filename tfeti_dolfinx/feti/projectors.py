@@ -67,7 +67,8 @@ class Grams:
             G_f = G[face.free[rows]]
             sums[places] += (G_f.T @ G_f).ravel()
         sums[-2:] = np.any(face.status[self._always] != Status.FREE), len(face.tangents)
-        *_, others, tangents = summed(self.comm, sums)
+        sums = summed(self.comm, sums)
+        others, tangents = sums[-2:]
         if others:
             along = face.Z.T @ self.Gt
             gram = replicated(along.T.tocsr() @ along, self.comm)
