@@ -5,7 +5,7 @@ import pytest
 from test_repeated import Repeated, distance
 
 from tfeti_dolfinx.common.parallel import norm_over
-from tfeti_dolfinx.qp.krylov import Directions, pcpg
+from tfeti_dolfinx.qp.krylov import Directions, PcpgParameters, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.recycling import DirectionStore, right_singular
 from tfeti_dolfinx.qp.sets import Product
@@ -129,7 +129,7 @@ def test_hardly_more_steps_than_dimensions(spread, times):
     assert steps <= times * n
     error = found - known
     assert error @ F @ error <= 1e-10 * (known @ F @ known)
-    _, more, _ = solved(qp, Directions(qp, keeps=False), 1e-9, 5000)
+    _, more, _ = solved(qp, Directions(qp, PcpgParameters(keeps=False)), 1e-9, 5000)
     assert more >= (steps if spread < 1e6 else 4 * steps)
 
 

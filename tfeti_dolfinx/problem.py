@@ -276,9 +276,7 @@ class ContactProblem:
         dual, gluing = system.make(seconds), system.gluing
         now = self.options
         options = replace(system.options, rtol=now.rtol, atol=now.atol, warnings=now.warnings)
-        dual.forget_counts()
-        dual.begin = system.begun()
-        dual.negligible = self._negligible(dual.subdomains)
+        dual.begin_solve(system.begun(), self._negligible(dual.subdomains))
         # 1. the multipliers
         with stage("solve", seconds):
             start = None

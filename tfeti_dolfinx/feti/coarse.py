@@ -78,6 +78,7 @@ class CoarseSpace(Coarse):
         self.subdomains, self.comm, self.sigma = subdomains, subdomains.comm, sigma
         self.bounded, self.rubbing = sets.normals, sets.tangents.ravel()
         comm, springs = self.comm, sets.springs if subdomains.num_springs else sets.springs[:0]
+        # 1. rows of B R, and on motions of bodies
         kernel = subdomains.kernel_rows
         offsets = chunk_offsets(comm, kernel.shape[1])
         dimension = int(offsets[-1])
@@ -97,21 +98,22 @@ class CoarseSpace(Coarse):
         self.row_size = np.where(sizes > 0.0, sizes, 1.0)
         self.bodies = Bodies(subdomains, *names)
         self.J = self._on_bodies(Gt)
+        # 2. motions that rows leave free: equalities, with soft springs, with contact
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[sets.contact] = False
-        self.unheld = self._unglued = self.unresisted(equalities, self.bodies.unsprung)
         glues = np.array(equalities)
         glues[springs] = False
+        self.unheld = self._unglued = self.unresisted(glues, self.bodies.unsprung)
         if subdomains.num_springs:
-            self._unglued = self.unresisted(glues, self.bodies.unsprung)
+            self.unheld = self.unresisted(equalities, self.bodies.unsprung)
         # contact does not hold bodies that move as one; nor do its rows then in G
         J, several = self.J, self.bodies.count > 1 and self.unheld.free.any()
         if several and any_rank(comm, len(self.rubbing) > 0):
             self.J = J.without(self.bodies.as_one(self.unheld))
         self.free_motions = self.unresisted(~equalities)
         self.J = J.without(self.free_motions.joint)
-        both = self.free_motions.columns
-        # made on one rank: processors that round differently might choose differently
+        # 3. a basis of the kernel with these motions, made on one rank: processors that round
+        # differently might choose differently
         self._basis = bcast_from_root(
             comm, kernel_basis(self.bodies, self._unglued, self.free_motions)
         )
@@ -119,7 +121,9 @@ class CoarseSpace(Coarse):
         self.work = self.motions.transposed
         rows = replace(self.J, parts=self.J.parts * self.row_size[self.J.row, None])
         Gt = self._basis.rows(Gt, rows, glues)
-        null = self.motions.csr() @ both if both.shape[1] else csr_array((dimension, 0))
+        free = self.free_motions.columns
+        null = self.motions.csr() @ free if free.shape[1] else csr_array((dimension, 0))
+        # 4. GGᵀ
         self.null = bcast_from_root(comm, orthonormal_columns(null))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, NullModes(self.null), prefix)

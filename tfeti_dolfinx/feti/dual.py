@@ -108,8 +108,7 @@ class Dual:
         last: The last solution of block Newton, or without a kernel, with its image; ``solved`` are
             d and e of its program.
         recycled: Directions of earlier solves; None: none are kept.
-        begin: Where the load step began, shape ``(n,)``; bodies that nothing holds stay near.
-        negligible: Displacements of bodies that count as none, shape ``(bodies,)``.
+        begin, negligible: As ``begin_solve`` has it.
     """
 
     def __init__(
@@ -269,8 +268,13 @@ class Dual:
             self.constraints = self._given.with_pressures(pressures)
         self.feasible = self.law(self.constraints)
 
-    def forget_counts(self) -> None:
-        """Count multiplications from 0 on."""
+    def begin_solve(self, begin: Array | float = 0.0, negligible: Array | float = 0.0) -> None:
+        """Count multiplications from 0 on, of a solve in a load step.
+
+        ``begin`` is where that began, shape ``(n,)``: bodies that nothing holds stay near;
+        ``negligible`` are displacements of bodies that count as none, shape ``(bodies,)``.
+        """
+        self.begin, self.negligible = begin, negligible
         for operator in (self.F, self.preconditioner):
             if operator is not None:
                 operator.count = 0

@@ -167,8 +167,7 @@ class SemidefiniteFactor:
         what: str,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.comm, self._null = comm, null
-        self._scale, pinned = _scaling(A, null)
+        self._null, (self._scale, pinned) = null, _scaling(A, null)
         scaled = _scaled(A, self._scale, pinned)
         self._factor: CholeskyFactor | None = None
         self._shift = 0.0

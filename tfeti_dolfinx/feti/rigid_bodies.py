@@ -205,7 +205,17 @@ class BodyRows:
 
 @dataclass(frozen=True)
 class Motions:
-    """A space of motions of bodies, each of k coordinates."""
+    """A space of motions of bodies, each of k coordinates.
+
+    These are used, from the largest to the smallest:
+
+    ============================  =============================================================
+    ``Bodies.unsprung``           not resisted by springs that stiffnesses have
+    ``CoarseSpace.unheld``        nor by equality rows, soft springs among them: what contact holds
+    ``Recovered.loose``           nor by a row of contact with a force, at an iterate
+    ``CoarseSpace.free_motions``  nor by any row
+    ============================  =============================================================
+    """
 
     single: Array  # orthonormal directions of each body, as columns, shape (bodies, k, k)
     free: Array  # which of them the body can take alone, shape (bodies, k)

@@ -75,9 +75,6 @@ class PcpgParameters:
     keeps: bool = True
 
 
-DEFAULT = PcpgParameters()
-
-
 class Directions:
     """State of PCPG between calls, from which it continues where it stopped.
 
@@ -86,18 +83,19 @@ class Directions:
         p: The last direction.
         fresh: Whether the next direction is the first.
         kept: Directions, and what PF makes of them, that the next one is made conjugate to: with
-            ``keeps`` all that memory lasts for. In exact arithmetic it is conjugate to all if it is
-            to the last one; rounding undoes that where F is ill conditioned on a face (Farhat,
-            Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
+            ``parameters.keeps`` all that memory lasts for. In exact arithmetic it is conjugate to
+            all if it is to the last one; rounding undoes that where F is ill conditioned on a face
+            (Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
         norm: Largest Rayleigh quotient of F that a direction has shown; at most ‖PFP‖.
         helped: Largest rᵀz/rᵀr so far.
     """
 
-    def __init__(self, qp: QP, keeps: bool = True) -> None:
+    def __init__(self, qp: QP, parameters: PcpgParameters = PcpgParameters()) -> None:
+        self.parameters = parameters
         self.r, self.p = np.zeros(len(qp.d)), np.zeros(len(qp.d))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
         rows = int(largest(qp.coarse.comm, np.array([len(qp.d)])))
-        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if keeps else 1
+        most = max(parameters.numbers // (2 * max(rows, 1)), 1) if parameters.keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
@@ -107,7 +105,7 @@ class Directions:
         """
         if not short:
             self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
-        return pFp > DEFAULT.flat * self.norm * pp
+        return pFp > self.parameters.flat * self.norm * pp
 
 
 # --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
@@ -142,9 +140,10 @@ def pcpg(
     left.
     """
     own, comm = Directions(qp) if directions is None else directions, qp.coarse.comm
+    given = own.parameters
     recycled, (point, past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
-    least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
+    least = given.short**2 * qp.dot((point.lam, point.lam))[0]
     while True:
         # test
         small = norm <= rule.tolerance
@@ -178,7 +177,7 @@ def pcpg(
         squared, rz, rp, pFp = summed(comm, np.array([left @ left, *known]))
         short = bool(pFp) and (rp / pFp) ** 2 * pp < least
         own.helped = max(own.helped, rz / norm**2 if norm > 0.0 else 0.0)
-        if not (own.seen(pFp, pp, short) and rz > DEFAULT.flat * own.helped * norm**2):
+        if not (own.seen(pFp, pp, short) and rz > given.flat * own.helped * norm**2):
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
@@ -187,7 +186,7 @@ def pcpg(
         if recycled is not None:
             new = [*new[1 - recycled.capacity :], (p, Fp, pFp)]
         own.r = left
-        drifts, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
+        drifts, norm = abs(rp - rz) > given.drifted * rz, float(np.sqrt(squared))
         # images of earlier solves are too inexact where r is not even orthogonal to a first p
         past, own.fresh = None if drifts and own.fresh else past, drifts
         steps.cg += 1
@@ -201,7 +200,7 @@ def solve_by_pcpg(
     qp: QP,
     start: Start,
     rule: StoppingRule,
-    parameters: PcpgParameters = DEFAULT,
+    parameters: PcpgParameters = PcpgParameters(),
     *,
     max_it: int = 10_000,
     monitor: Monitor = no_monitor,
@@ -223,7 +222,7 @@ def solve_by_pcpg(
     """
     steps = Steps()
     monitor(steps, "start", start.at.lam, norm_over(qp.coarse.comm, start.b), 0.0)
-    directions = Directions(qp, parameters.keeps)
+    directions = Directions(qp, parameters)
     point, reason = pcpg(qp, start.at, rule, steps, max_it, monitor, directions)
     g = qp.coarse.project(point.g)
     norm = norm_over(qp.coarse.comm, g)

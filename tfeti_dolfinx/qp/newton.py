@@ -10,7 +10,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import any_rank, count_over, largest, least, norm_over, steering
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
-from tfeti_dolfinx.qp.krylov import Directions, pcpg
+from tfeti_dolfinx.qp.krylov import Directions, PcpgParameters, pcpg
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
@@ -78,7 +78,7 @@ class NewtonParameters:
     # whether rows leave a face one by one after a step in which all together have raised q, or
     # two in which what was left did not balance the load
     cautious: bool = True
-    keeps: bool = True  # that of PCPG
+    pcpg: PcpgParameters = PcpgParameters()  # those of solves on faces
 
 
 # --- Step 0: start ----------------------------------------------------------------------------
@@ -210,6 +210,7 @@ class NewtonIteration:
         since: So many have not found ‖g^P‖ half of ``least``.
         unbalanced: Whether the last end of step 3 was outside of Ω or did not fulfil Gλ = e.
         resume: Whether λ is where PCPG has stopped.
+        cautious: Whether rows leave as they block, after q rose, or two ends did not balance.
     """
 
     def __init__(
@@ -220,7 +221,8 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
         self.pressed = qp.feasible.face(z.lam, z.g)
         self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.since, self.resume, self.unbalanced = 0, 0, False, False
+        self.idle, self.since = 0, 0
+        self.resume = self.unbalanced = self.cautious = False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
@@ -299,7 +301,7 @@ class NewtonIteration:
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
         unbalanced, self.unbalanced = self.unbalanced and not feasible, not feasible
         early = unbalanced or (rose and self.idle < 2)
-        self.solver.cautious = self.parameters.cautious and early
+        self.cautious = self.parameters.cautious and early
         if taken:
             self._go(end, 0.5 * double)
         if not taken and not looked:
@@ -340,7 +342,6 @@ class FaceSolver:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
-        cautious: Whether rows leave as they block, after q rose, or two ends did not balance.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -355,22 +356,22 @@ class FaceSolver:
     ) -> None:
         self._qp, self._rule, self._parameters = qp, rule, parameters
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
-        self.directions = Directions(qp, parameters.keeps)
+        self.directions = Directions(qp, parameters.pcpg)
         self.directions.norm = qp.norm
         self._face: Face | None = None
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
-        self._status, self.cautious, self.rounds = np.zeros(len(qp.d)), False, 0
+        self._status, self.rounds = np.zeros(len(qp.d)), 0
         self.excluding: Array | None = None
         self.left = np.inf
 
     def solve(
-        self, start: Point, face: Face, optimality: float, resume: bool
+        self, start: Point, face: Face, optimality: float, resume: bool, cautious: bool
     ) -> tuple[Point, bool]:
         """Step 3: solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
         ‖g^P‖ is that at the start, a feasible point of the face; ``resume``: PCPG has stopped
-        there, and goes on if the face stays. Return where PCPG ended on the last face, and whether
-        that is in Ω and fulfils Gλ = e.
+        there, and goes on if the face stays; ``cautious``: rows leave as they block. Return where
+        PCPG ended on the last face, and whether that is in Ω and fulfils Gλ = e.
         """
         z, stays, self.rounds = start, self._enter(face) and resume, 0
         while True:
@@ -383,7 +384,7 @@ class FaceSolver:
             out, stays = self._has_left(end), False
             if not out or self._steps.cg >= self._max_it:
                 break
-            if self.cautious:
+            if cautious:
                 z = self._blocked(z, end)
                 continue
             if (restored := self._restored(end)) is None:
@@ -578,7 +579,7 @@ def newton(
             # Step 2: the face
             first, face = state.wanted_face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        end, feasible = solver.solve(first, face, state.residual, state.resume)
+        end, feasible = solver.solve(first, face, state.residual, state.resume, state.cautious)
         # Step 4: accept where q falls enough
         if solver.excluding is not None:
             reason = ConvergedReason.DIVERGED_CONTRADICTION

@@ -78,13 +78,14 @@ def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
     if friction == "auto":
         friction = "newton" if qp_type == "newton" else "fixed_point"
     keeps, cautious = (name not in options.without for name in ("kept_directions", "cautious"))
+    pcpg = replace(options.pcpg, keeps=keeps)
     return replace(
         options,
         qp_type=qp_type,
         pc_type=pc_type,
         friction_type=friction,
-        pcpg=replace(options.pcpg, keeps=keeps),
-        newton=replace(options.newton, keeps=keeps, cautious=cautious),
+        pcpg=pcpg,
+        newton=replace(options.newton, pcpg=pcpg, cautious=cautious),
     )
 
 

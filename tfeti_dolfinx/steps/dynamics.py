@@ -175,7 +175,7 @@ class Predictor:
         """Return the displacement in primal order."""
         dual, options, start = self._dual, self._options, None
         assert dual is not None
-        dual.forget_counts()
+        dual.begin_solve()
         if self.rows_and_start is not None:  # nothing has a kernel in M
             start = (gluing.multipliers(*self.rows_and_start), np.zeros(0))
             if self.rows_and_start[0] is gluing:
