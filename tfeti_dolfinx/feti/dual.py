@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -22,13 +21,12 @@ from tfeti_dolfinx.feti.operator import (
     mean_stiffness,
     scaled_rows,
 )
-from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
-from tfeti_dolfinx.feti.projectors import FaceFactors
+from tfeti_dolfinx.feti.preconditioner import Deflation, FacePreconditioners, MakeDeflation
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
-from tfeti_dolfinx.qp.problem import QP, FaceOperator, KnownProduct, Operator
+from tfeti_dolfinx.qp.problem import QP, KnownProduct
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, FeasibleSet, Product, Status
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, FeasibleSet, Product
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -65,23 +63,6 @@ def contact_set(constraints: Constraints) -> FeasibleSet:
     if sets.tangents.size == 0:
         return Product([normals])
     return Product([normals, (sets.tangents.ravel(), Ellipses(constraints.limits))])
-
-
-class Deflation(Protocol):
-    """A coarse space of a preconditioner on faces."""
-
-    count: int  # number of its motions, of all subdomains
-    factors: FaceFactors  # makes the factors of faces, and counts them
-
-    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
-        """Return M_f, which is taken over, with these motions. Collective."""
-
-    def destroy(self) -> None:
-        """Free what belongs to it. Collective."""
-
-
-# from B, the natural coarse space, weights and a prefix of options
-MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, str], Deflation]
 
 
 class Dual:
@@ -130,7 +111,6 @@ class Dual:
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
-        self._prefix = f"{options_prefix}face_"
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self._stiffness = largest(comm, subdomains.diagonal)
         self._set_linear_term(comm)
@@ -151,9 +131,6 @@ class Dual:
         self.late = self.preconditioner if isinstance(self.preconditioner, LateDirichlet) else None
         if self.preconditioner is not None and own and self.late is None:
             self._lifting = self.preconditioner.local
-        self._on_faces: FacePreconditioner | None = None
-        self._on_all: FaceOperator | None = None
-        self._on_last: tuple[Face, FaceOperator] | None = None
         self._held_load: Array | None = None
         prefix, sigma = f"{options_prefix}coarse_", 1.0
         if subdomains.num_springs:
@@ -166,8 +143,17 @@ class Dual:
         names = body_names, mode_names
         self.coarse = CoarseSpace(constraints, subdomains, names, sigma, prefix)
         self.deflation: Deflation | None = None
-        if self.preconditioner is not None and deflation is not None:
-            self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
+        self._on_faces: FacePreconditioners | None = None
+        if self.preconditioner is not None:
+            if deflation is not None:
+                self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
+            self._on_faces = FacePreconditioners(
+                self.preconditioner,
+                constraints,
+                subdomains.diagonal,
+                f"{options_prefix}face_",
+                self.deflation,
+            )
         self.contact_rows = constraints.contact_rows
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
@@ -292,15 +278,15 @@ class Dual:
             before = self.F.count
             self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)
             self.norm_count, self.F.count = self.F.count - before, before
-        on = self._preconditioner_on if self.preconditioner is not None else None
+        on = self._on_faces
         return QP(
             self.F,
             self.d,
             self.coarse,
             self.feasible,
-            preconditioner=self._on_all_rows,
+            preconditioner=None if on is None else on.on_all_rows(),
             norm=self._norms.get(norm_steps, self.seen),
-            preconditioner_on=on,
+            preconditioner_on=None if on is None else on.on_face,
             recycled=self.recycled,
             sprung=self.subdomains.num_springs > 0,
             rough=self.rough,
@@ -319,42 +305,6 @@ class Dual:
             sigma *= LIMITS.stiffer
         softer = count ** (1.0 / max(self._dimension - 1, 1))
         return np.asarray(-sigma / softer * self.constraints.c)
-
-    @property
-    def _on_all_rows(self) -> Operator | None:
-        """Return the preconditioner on all rows, made once."""
-        given = self.preconditioner
-        smooths = given is not None and (given is self.late or given.metric is not None)
-        count = 0 if self.deflation is None else self.deflation.count
-        if not (count or (smooths and not any(self.contact_rows))):
-            return self.preconditioner
-        if self._on_all is None:
-            rows = self.constraints.num_rows
-            face = Face(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
-            self._on_all = self._made_on(face)
-        return self._on_all
-
-    def _preconditioner_on(self, face: Face) -> FaceOperator:
-        """Return the preconditioner on a face, that of the last time if it is that face."""
-        if self._on_last is not None:
-            known, operator = self._on_last
-            if not any_rank(self.coarse.comm, not face.is_like(known)):
-                return operator
-            self._on_last = None
-            operator.destroy()
-        self._on_last = face, self._made_on(face)
-        return self._on_last[1]
-
-    def _made_on(self, face: Face) -> FaceOperator:
-        """Make the preconditioner on a face; parts that all faces share are made once."""
-        assert self.preconditioner is not None
-        if self._on_faces is None:
-            diagonal = self.subdomains.diagonal
-            self._on_faces = FacePreconditioner(
-                self.preconditioner, self.constraints, diagonal, self._prefix
-            )
-        made = self._on_faces.on_face(face)
-        return made if self.deflation is None else self.deflation.balanced(face, made)
 
     @property
     def driving(self) -> Array:
@@ -388,8 +338,7 @@ class Dual:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
-        last = None if self._on_last is None else self._on_last[1]
-        own = (last, self._on_all, self._on_faces, self.deflation, self.preconditioner)
-        for item in (self.F, *own, self._scaled):
+        own = (self.F, self._on_faces, self.deflation, self.preconditioner, self._scaled)
+        for item in own:
             if item is not None:
                 item.destroy()
