@@ -171,8 +171,7 @@ class CoarseSpace(Coarse):
         √(D/σ) Pᵀu − λ/σ, in the length that makes a spring as stiff as a row.
         """
         parts = [(b.springs, u[part]) for b, part in self.subdomains.block_parts]
-        stretches = [np.sqrt(of.stiffness) * (of.stretches.T @ v) for of, v in parts if of]
-        stretched = joined(stretches) / np.sqrt(self.sigma)
+        stretched = joined([of.stretched(v) for of, v in parts if of]) / np.sqrt(self.sigma)
         return np.asarray(stretched - lam[self.springs] / self.sigma)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
