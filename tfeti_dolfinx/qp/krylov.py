@@ -244,9 +244,9 @@ def solve_by_pcpg(
 
 
 def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
-    """Apply the stopping rule to the point."""
+    """Apply the stopping rule to the point; what ‖F‖ is nothing tells."""
     face = qp.feasible.face(point.lam, point.g)
-    return rule.examine(point.lam, point.g, face, norm, qp.norm)
+    return rule.examine(point.lam, point.g, face, norm, 0.0)
 
 
 def _begun(qp: QP, point: Point, own: Directions) -> tuple[Point, Along | None, float]:
@@ -254,13 +254,12 @@ def _begun(qp: QP, point: Point, own: Directions) -> tuple[Point, Along | None, 
 
     Projected twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
     """
-    project, face, past = qp.coarse.project, qp.coarse.face, None
+    project, recycled, past = qp.coarse.project, qp.recycled, None
+    held = None if qp.coarse.face is None else qp.coarse.face.held
     own.r = project(project(-point.g))
-    if qp.recycled is not None:
-        past = qp.recycled.on_face(None if face is None else face.held)
-    if past is not None and qp.recycled is not None:
-        way, b = past(own.r, qp.recycled.directions)
+    if recycled is not None and (past := recycled.on_face(held)) is not None:
+        way, b = past(own.r, recycled.directions)
         # rounding of many directions is none of Gλ = e
-        point = Point(point.lam + project(way), point.g + qp.recycled.images.T @ b)
+        point = Point(point.lam + project(way), point.g + recycled.images.T @ b)
         own.fresh, own.r = True, project(project(-point.g))
     return point, past, norm_over(qp.coarse.comm, own.r)

@@ -249,8 +249,8 @@ class StoppingRule:
         """Examine an iterate whose residuals are small. Collective.
 
         ``gradient`` is Fλ − d up to the range of Gᵀ, ``residual`` max(‖g^P‖, ‖F‖‖Qx‖), ``norm``
-        ‖F‖, or an estimate: residuals over it are errors of multipliers. Return why to stop, or
-        ITERATING; then ``tolerance`` is below ``residual``.
+        ‖F‖, or an estimate, or 0: residuals over it are errors of multipliers. Return why to stop,
+        or ITERATING; then ``tolerance`` is below ``residual``.
         """
         small = residual <= self.tolerance
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING
