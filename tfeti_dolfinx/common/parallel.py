@@ -45,8 +45,8 @@ def any_rank(comm: MPI.Intracomm, flag: bool | Array) -> bool:
 
 def summed(comm: MPI.Intracomm, values: Array) -> Array:
     """Return the sums of all ranks' values, entry by entry: one reduction. Collective."""
-    sums = np.empty_like(values)
-    comm.Allreduce(values, sums, op=MPI.SUM)
+    sums = np.array(values)
+    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     return sums
 
 

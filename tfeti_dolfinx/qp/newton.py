@@ -500,8 +500,7 @@ class FaceSolver:
         share = given.stage if resume else given.reduction
         target = share * min(norm_over(qp.coarse.comm, self.coarse.project(z.g)), optimality)
         lowest = 0.0 if self._rule.waits else given.final * self._rule.tolerance
-        rule = StoppingRule(max(target, lowest))
-        norm = own.norm
+        rule, norm = StoppingRule(max(target, lowest)), own.norm
         end, reason = pcpg(self._on_face, z, rule, self._steps, self._max_it, self._monitor, own)
         self.left = norm_over(qp.coarse.comm, own.r)
         if self._curved:
