@@ -34,7 +34,7 @@ from benchmarks.tools import FILE, command_line, finish, json_of
 from demos import scene
 from tfeti_dolfinx.feti.preconditioner import PARAMETERS
 from tfeti_dolfinx.qp.krylov import pcpg
-from tfeti_dolfinx.qp.problem import Point, Steps, StoppingRule, homogenise
+from tfeti_dolfinx.qp.problem import Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
@@ -87,7 +87,7 @@ def sent_by_steps(dual, sent):
     start, found = homogenise(qp), []
     for count in (FEW, MORE):
         before, steps = sent.copy(), Steps()
-        pcpg(qp, Point(start.lam_bar, start.gradient), StoppingRule(0.0), steps, count)
+        pcpg(qp, start.at, StoppingRule(0.0), steps, count)
         assert steps.cg == count
         found.append(sent - before)
     return (found[1] - found[0]) / (MORE - FEW)

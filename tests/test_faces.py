@@ -11,10 +11,10 @@ from test_solvability import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.parallel import dot_over, norm_over
-from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.sets import Face, Product, Status
+from tfeti_dolfinx.testing import DenseCoarse
 
 
 def in_a_corner(**options):
@@ -120,8 +120,8 @@ def test_pcpg_on_a_face(preconditioned, with_coarse):
     helper = matrix(Z @ np.linalg.inv(Z.T @ F @ Z) @ Z.T) if preconditioned else None
     on_face = replace(qp, coarse=coarse.on_face(face), preconditioner=helper)
     start = np.random.default_rng(5).standard_normal(40)
-    point, steps = Point(start, F @ start - d), Steps()
-    reason = pcpg(on_face, point, StoppingRule(1e-11), steps, 100)
+    steps, first = Steps(), Point(start, F @ start - d)
+    point, reason = pcpg(on_face, first, StoppingRule(1e-11), steps, 100)
     assert reason == ConvergedReason.CONVERGED_RTOL
     assert steps.cg <= (12 if preconditioned else 26)
     assert np.allclose(point.g, F @ point.lam - d, atol=1e-9)

@@ -12,9 +12,10 @@ from test_mpgp import as_set
 from test_qp import matrix, vector
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.qp.coarse import Coarse, DenseCoarse
+from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.friction_newton import Law, LawPoint, LawProgram, newton_on_law
 from tfeti_dolfinx.qp.problem import QP
+from tfeti_dolfinx.testing import DenseCoarse
 
 SEEDS = st.integers(0, 1000)
 DIMENSIONS = st.sampled_from([1, 2])

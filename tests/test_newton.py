@@ -11,13 +11,14 @@ from test_newton_discs import solved
 from test_qp import bounds_on, matrix, vector
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.qp.coarse import DenseCoarse, imbalance
+from tfeti_dolfinx.qp.coarse import imbalance
 from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import first_point, newton
-from tfeti_dolfinx.qp.problem import QP, StoppingRule, homogenise, operator_product
+from tfeti_dolfinx.qp.problem import QP, StoppingRule, homogenise
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Product
+from tfeti_dolfinx.testing import DenseCoarse
 
 
 def program(seed, kind="regular"):
@@ -124,12 +125,7 @@ def test_rows_that_exclude_each_other_are_named(room, solvable):
     d = vector([1.0, -1.0 - room, 1.0])
     qp = QP(matrix(F), d, DenseCoarse(np.zeros((0, 3)), np.zeros(0)), bounds_on(np.arange(3)))
     start = vector([1.0, 1.0, 0.0])  # both touch
-    result = newton(
-        qp,
-        homogenise(qp, operator_product(qp.F, qp.coarse.comm, start)),
-        StoppingRule(1e-10),
-        max_it=100,
-    )
+    result = newton(qp, homogenise(qp, start), StoppingRule(1e-10), max_it=100)
     if not solvable:
         assert result.reason.name == "DIVERGED_CONTRADICTION"
         assert result.excluding.tolist() == [0, 1]

@@ -11,29 +11,19 @@ from test_discs import discs
 from test_mpgp import around_circles, as_set, program
 from test_qp import Counted, matrix, to, vector
 
-from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import (
-    QP,
-    ConvergedReason,
-    Start,
-    StoppingRule,
-    homogenise,
-    no_monitor,
-    operator_product,
-)
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, StoppingRule, homogenise, no_monitor
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import Status
 from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.testing import DenseCoarse
 
 
-def solved(qp, tolerance, monitor=no_monitor, start=None):
-    at = operator_product(
-        qp.F, qp.coarse.comm, feasible_start(qp, start) if start else first_point(qp)
-    )
-    rule = StoppingRule(tolerance)
-    return newton(qp, homogenise(qp, at), rule, max_it=3000, start=start, monitor=monitor)
+def solved(qp, tolerance, monitor=no_monitor, lam=None, mu=None):
+    at = homogenise(qp, first_point(qp) if lam is None else feasible_start(qp, lam))
+    start = replace(at, lam=lam, mu=mu)
+    return newton(qp, start, StoppingRule(tolerance), max_it=3000, monitor=monitor)
 
 
 @settings(max_examples=12)
@@ -43,9 +33,8 @@ def test_random_programs(seed, k, isotropic):
     F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
     feasible = as_set(bounded, pairs, a, isotropic)
     qp = QP(matrix(F), vector(d), DenseCoarse(G, e), feasible)
-    qp = replace(qp, norm=estimate_norm(qp.F, qp.coarse, 60))
-    start = homogenise(qp)
-    slow = smalse(qp, start, to(1e-10, start), max_it=20_000)
+    start, norm = homogenise(qp), estimate_norm(qp.F, qp.coarse, 60)
+    slow = smalse(replace(qp, norm=norm), start, to(1e-10, start), max_it=20_000)
     for result in (solved(qp, 1e-10 * np.linalg.norm(d)), slow):
         assert result.reason == ConvergedReason.CONVERGED_RTOL
         lam = result.lam
@@ -94,7 +83,7 @@ def test_from_its_own_solution_it_multiplies_once():
     F = Counted(matrix(F))
     qp = QP(F, vector(d), DenseCoarse(G, e), as_set(bounded, pairs, a, True))
     found, before = solved(qp, 1e-10), F.count
-    again = solved(replace(qp, seen=found.norm), 1e-8, start=Start(found.lam, found.mu))
+    again = solved(replace(qp, norm=found.norm), 1e-8, lam=found.lam, mu=found.mu)
     assert again.steps.cg == again.steps.outer == 0
     assert F.count == before + 1
     assert np.allclose(again.lam, found.lam, atol=1e-9)

@@ -11,12 +11,12 @@ from reference.untorn import check_optimal
 from scipy.sparse import diags_array
 
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
+from tfeti_dolfinx.testing import DenseCoarse
 
 SELF = MPI.COMM_SELF
 
@@ -116,7 +116,7 @@ def test_pcpg_solves_the_saddle_point_system(seed):
 def test_smalse_says_that_nothing_fulfils_the_equality(M):
     """λ ≥ 0 and λ_1 + λ_2 = −√2 exclude each other."""
     coarse = DenseCoarse(np.ones((1, 2)) / np.sqrt(2), np.array([-1.0]))
-    qp = QP(matrix(np.eye(2)), vector([0.0, 0.0]), coarse, Bounds())
+    qp = QP(matrix(np.eye(2)), vector([0.0, 0.0]), coarse, Bounds(), norm=1.0)
     result = smalse(qp, homogenise(qp), StoppingRule(1e-6), SmalseParameters(M=M), max_it=5000)
     assert result.reason == ConvergedReason.DIVERGED_STALLED
     assert result.steps.outer < 2000

@@ -1,17 +1,15 @@
 """Directions of earlier solves: what they save, and that they stay right."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from test_repeated import Repeated, distance
 
 from tfeti_dolfinx.common.parallel import norm_over
-from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.krylov import Directions, pcpg
+from tfeti_dolfinx.qp.krylov import Directions, PcpgParameters, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.recycling import DirectionStore, right_singular
 from tfeti_dolfinx.qp.sets import Product
+from tfeti_dolfinx.testing import DenseCoarse
 
 
 def images(problem):
@@ -116,10 +114,10 @@ def program(spread):
 
 
 def solved(qp, directions, target, most=1000):
-    steps, point = Steps(), Point(np.zeros(n), -qp.d)
-    target *= np.linalg.norm(point.g)
-    reason = pcpg(qp, point, StoppingRule(target), steps, most, directions=directions)
-    return reason, steps.cg, point.lam
+    steps, rule = Steps(), StoppingRule(target * np.linalg.norm(qp.d))
+    start = Point(np.zeros(n), -qp.d)
+    end, reason = pcpg(qp, start, rule, steps, most, directions=directions)
+    return reason, steps.cg, end.lam
 
 
 @pytest.mark.parametrize(("spread", "times"), [(1e2, 1.0), (1e6, 1.1), (1e8, 3.0)])
@@ -131,7 +129,7 @@ def test_hardly_more_steps_than_dimensions(spread, times):
     assert steps <= times * n
     error = found - known
     assert error @ F @ error <= 1e-10 * (known @ F @ known)
-    _, more, _ = solved(qp, Directions(replace(qp, keeps=False)), 1e-9, 5000)
+    _, more, _ = solved(qp, Directions(qp, PcpgParameters(keeps=False)), 1e-9, 5000)
     assert more >= (steps if spread < 1e6 else 4 * steps)
 
 

@@ -13,7 +13,7 @@ from test_solvability import dual_of
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.qp.krylov import pcpg
-from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps, StoppingRule, homogenise
+from tfeti_dolfinx.qp.problem import ConvergedReason, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 
@@ -46,10 +46,9 @@ def dual(request):
 
 def count(qp, num_steps):
     """Global calls of so many steps, with what comes before and after them."""
-    start = homogenise(qp)
-    point, steps = Point(start.lam_bar, start.gradient), Steps()
+    start, steps = homogenise(qp).at, Steps()
     before = qp.coarse.comm.calls
-    reason = pcpg(qp, point, StoppingRule(0.0), steps, num_steps)
+    _, reason = pcpg(qp, start, StoppingRule(0.0), steps, num_steps)
     assert reason == ConvergedReason.DIVERGED_ITS
     assert steps.cg == num_steps
     return qp.coarse.comm.calls - before

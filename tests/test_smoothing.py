@@ -79,7 +79,7 @@ def test_the_preconditioner_is_what_its_formula_says(dual, kappa, serial_only):
     steps, part = 3, 8.0
     c, pc = dual.constraints, dual.preconditioner
     face = face_with_springs(dual, kappa)
-    M = dual._preconditioner_on(face)
+    M = dual.qp().preconditioner_on(face)
     K, S = (local_matrix(op, len(c.weights)) for op in (pc.metric.trace, pc.local))
     B = c.B.convert("dense").getDenseArray().copy()
     Z, D = face.Z.toarray(), c.weights

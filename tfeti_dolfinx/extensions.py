@@ -12,8 +12,9 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.validation import checked_callable, checked_type, named, shown
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.feti.dual import FeasibleLaw, MakeDeflation, contact_set
+from tfeti_dolfinx.feti.dual import FeasibleLaw, contact_set
 from tfeti_dolfinx.feti.operator import MakePreconditioner
+from tfeti_dolfinx.feti.preconditioner import MakeDeflation
 from tfeti_dolfinx.feti.stopping import Accuracy, MakeRule
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs

@@ -25,6 +25,7 @@ from tfeti_dolfinx.common.validation import (
 )
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
+from tfeti_dolfinx.qp.krylov import PcpgParameters
 from tfeti_dolfinx.qp.newton import NewtonParameters
 from tfeti_dolfinx.qp.smalse import SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
@@ -141,6 +142,7 @@ class Options:
         "most problems with Tresca's bounds that are solved for Coulomb's law",
         fits=FROM_1,
     )
+    pcpg: PcpgParameters = PcpgParameters()
     newton: NewtonParameters = NewtonParameters()
     smalse: SmalseParameters = SmalseParameters()
     without: tuple[str, ...] = described(

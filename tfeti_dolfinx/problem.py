@@ -270,9 +270,7 @@ class ContactProblem:
         dual, gluing = system.make(seconds), system.gluing
         now = self.options
         options = replace(system.options, rtol=now.rtol, atol=now.atol, warnings=now.warnings)
-        dual.forget_counts()
-        dual.begin = system.begun()
-        dual.negligible = self._negligible(dual.subdomains)
+        dual.begin_solve(system.begun(), self._negligible(dual.subdomains))
         # 1. the multipliers
         with stage("solve", seconds):
             start = None
@@ -311,7 +309,7 @@ class ContactProblem:
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
         contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
         excluding = system.search.named(contacts)
-        loose = dual.nearly_free(state.loose) if options.warnings else []
+        loose = dual.coarse.nearly_free(state.loose) if options.warnings else []
         self._rounding = accuracy.allowed.rounding
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, loose)
         outcome.solver = f"{options.qp_type} + {options.pc_type}"
@@ -509,7 +507,7 @@ class ContactProblem:
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
         if dual.constraints is not start[0].constraints:
             return state
-        state = replace(state, image=dual.last.known(self.dofs.comm, start[1]))
+        state = replace(state, image=dual.last.multiple(self.dofs.comm, start[1]))
         kept = dual.recycled
         return state if kept is None else replace(state, directions=kept.in_order())
 
@@ -544,7 +542,7 @@ class ContactProblem:
         dual.learn()
         if dual.recycled is not None:
             dual.recycled.take(state.directions)
-        dual.last.take(self.dofs.comm, state.lam, state.image)
+        dual.know(state.lam, state.image)
         # a face that only knows what rows do
         face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
         solution = self._make_solution(state.u, state.lam, face, gluing)

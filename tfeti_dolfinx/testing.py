@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.errors import require
+from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, face_at
 from tfeti_dolfinx.subdomains.block import (
     PROMISED,
@@ -285,3 +287,25 @@ def _check_inverse(block: Block, K: Array, w: Array, v: Array, tol: float) -> No
     require(np.abs(K @ u - force).max() <= tol * largest, "K K⁺ w = w for Rᵀ w = 0")
     on_trace, atol = block.apply_pinv(balanced), tol * np.abs(u).max()
     require(np.allclose(u[trace], on_trace, atol=atol), "solve and apply_pinv agree")
+
+
+# --- A coarse problem for tests of solvers ----------------------------------------------------
+
+
+class DenseCoarse(Coarse):
+    """A constraint from a dense G, for a program on one rank. Shapes ``(r, m)`` and ``(r,)``."""
+
+    def __init__(self, G: Array, e: Array) -> None:
+        inverse = np.linalg.pinv(G @ G.T, hermitian=True)
+        super().__init__(MPI.COMM_SELF, csr_array(G.T), e, inverse.__matmul__)
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
+        G_f = face.restricted(Gt := self.Gt.toarray())
+        return np.linalg.pinv(Gt.T @ G_f + damping * Gt.T @ Gt, hermitian=True) @ y
+
+    def on_face(self, face: Face) -> Coarse:
+        """Return the same G on a face."""
+        G_f = face.restricted(self.Gt.toarray())
+        inverse = np.linalg.pinv(G_f.T @ G_f, hermitian=True)
+        return Coarse(self.comm, self.Gt, self.e, inverse.__matmul__, face)

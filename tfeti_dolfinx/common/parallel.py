@@ -44,9 +44,10 @@ def any_rank(comm: MPI.Intracomm, flag: bool | Array) -> bool:
 
 
 def summed(comm: MPI.Intracomm, values: Array) -> Array:
-    """Sums of all ranks' values, entry by entry, in their place: one reduction. Collective."""
-    comm.Allreduce(MPI.IN_PLACE, values, op=MPI.SUM)
-    return values
+    """Return the sums of all ranks' values, entry by entry: one reduction. Collective."""
+    sums = np.array(values)
+    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
+    return sums
 
 
 def count_over(comm: MPI.Intracomm, flags: Array | int) -> int:

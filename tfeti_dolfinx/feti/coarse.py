@@ -1,5 +1,6 @@
 """The natural coarse space: G = Rᵀ Bᵀ, its projectors, and motions that no row of B resists."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -14,6 +15,7 @@ from tfeti_dolfinx.common.parallel import (
     chunk_offsets,
     joined_over,
 )
+from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
     FaceFactors,
@@ -41,11 +43,12 @@ class CoarseSpace(Coarse):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
 
     G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
-    ``bounded`` are local rows with λ ≥ 0, ``rubbing`` those of friction, ``springs`` those of
-    springs, behind all others: √(D/σ) PᵀR of these, so that F is 1/σ there. Creation and all
-    methods but ``spring_ends`` are collective.
+    Rows of springs are √(D/σ) PᵀR, so that F is 1/σ there. Creation and all methods but
+    ``spring_ends`` are collective. ``names`` are those of bodies and of their modes.
 
     Attributes:
+        bounded: Local rows with λ ≥ 0, ``rubbing`` those of friction, ``springs`` those of springs,
+            behind all others.
         dimension: r, the dimension of the kernel of K.
         e: (R T)ᵀ f, shape ``(r,)``; 0 instead of rounding where only contact holds a body.
         motions: The bodies' motions in the basis T; ``work`` is the product of their transpose with
@@ -65,22 +68,23 @@ class CoarseSpace(Coarse):
 
     def __init__(
         self,
-        B: PETSc.Mat,
+        constraints: Constraints,
         subdomains: Subdomains,
-        bounded: Array,
-        rubbing: Array,
-        springs: Array,
-        sigma: float,
+        names: tuple[Sequence[str], Sequence[str]],
+        sigma: float = 1.0,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.subdomains, self.bounded, self.rubbing = subdomains, bounded, rubbing
-        self.comm = comm = subdomains.comm
+        B, sets = constraints.B, constraints.sets
+        self.subdomains, self.comm, self.sigma = subdomains, subdomains.comm, sigma
+        self.bounded, self.rubbing = sets.normals, sets.tangents.ravel()
+        comm, springs = self.comm, sets.springs if subdomains.num_springs else sets.springs[:0]
+        # 1. rows of B R, and on motions of bodies
         kernel = subdomains.kernel_rows
         offsets = chunk_offsets(comm, kernel.shape[1])
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         Gt = transposed_G(B, kernel, dimension)
-        self.springs, self.sigma = springs, sigma
+        self.springs = springs
         indptr, _, data = B.getValuesCSR()
         row = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
         sizes = np.bincount(row, np.abs(data), minlength=len(indptr) - 1).astype(float)
@@ -92,23 +96,24 @@ class CoarseSpace(Coarse):
             )
             sizes[springs] = np.sqrt(own.power(2).sum(axis=1))
         self.row_size = np.where(sizes > 0.0, sizes, 1.0)
-        self.bodies = Bodies(subdomains)
+        self.bodies = Bodies(subdomains, *names)
         self.J = self._on_bodies(Gt)
+        # 2. motions that rows leave free: equalities, with soft springs, with contact
         equalities = np.ones(len(self.row_size), dtype=bool)
-        equalities[np.concatenate((bounded, rubbing))] = False
-        self.unheld = self._unglued = self.unresisted(equalities, self.bodies.unsprung)
+        equalities[sets.contact] = False
         glues = np.array(equalities)
         glues[springs] = False
+        self.unheld = self._unglued = self.unresisted(glues, self.bodies.unsprung)
         if subdomains.num_springs:
-            self._unglued = self.unresisted(glues, self.bodies.unsprung)
+            self.unheld = self.unresisted(equalities, self.bodies.unsprung)
         # contact does not hold bodies that move as one; nor do its rows then in G
-        J = self.J
-        if self.bodies.count > 1 and self.unheld.free.any() and any_rank(comm, len(rubbing) > 0):
+        J, several = self.J, self.bodies.count > 1 and self.unheld.free.any()
+        if several and any_rank(comm, len(self.rubbing) > 0):
             self.J = J.without(self.bodies.as_one(self.unheld))
         self.free_motions = self.unresisted(~equalities)
         self.J = J.without(self.free_motions.joint)
-        both = self.free_motions.columns
-        # made on one rank: processors that round differently might choose differently
+        # 3. a basis of the kernel with these motions, made on one rank: processors that round
+        # differently might choose differently
         self._basis = bcast_from_root(
             comm, kernel_basis(self.bodies, self._unglued, self.free_motions)
         )
@@ -116,7 +121,9 @@ class CoarseSpace(Coarse):
         self.work = self.motions.transposed
         rows = replace(self.J, parts=self.J.parts * self.row_size[self.J.row, None])
         Gt = self._basis.rows(Gt, rows, glues)
-        null = self.motions.csr() @ both if both.shape[1] else csr_array((dimension, 0))
+        free = self.free_motions.columns
+        null = self.motions.csr() @ free if free.shape[1] else csr_array((dimension, 0))
+        # 4. GGᵀ
         self.null = bcast_from_root(comm, orthonormal_columns(null))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, NullModes(self.null), prefix)
@@ -164,8 +171,7 @@ class CoarseSpace(Coarse):
         √(D/σ) Pᵀu − λ/σ, in the length that makes a spring as stiff as a row.
         """
         parts = [(b.springs, u[part]) for b, part in self.subdomains.block_parts]
-        stretches = [np.sqrt(of.stiffness) * (of.stretches.T @ v) for of, v in parts if of]
-        stretched = joined(stretches) / np.sqrt(self.sigma)
+        stretched = joined([of.stretched(v) for of, v in parts if of]) / np.sqrt(self.sigma)
         return np.asarray(stretched - lam[self.springs] / self.sigma)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
@@ -215,6 +221,13 @@ class CoarseSpace(Coarse):
             return np.empty(0, dtype=np.int64)
         moved = np.any(motion.reshape(self.bodies.count, -1), axis=1)
         return self.J.row[moved[self.J.body]]
+
+    def nearly_free(self, loose: Motions) -> list[dict[str, Any]]:
+        """List motions of those that contact rows hold hardly or not, see ``Bodies.listed``."""
+        if not self.unheld.free.any():  # conditions hold all bodies: contact need not
+            return []
+        hardly = replace(loose, free=loose.stiffness <= TOLERANCES.nearly)
+        return bcast_from_root(self.comm, self.bodies.listed(hardly))
 
     def unresisted(self, rows: Array, within: Motions | None = None) -> Motions:
         """Return motions of a space that rows do not resist.

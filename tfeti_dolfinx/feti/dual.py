@@ -1,15 +1,14 @@
 """The dual problem of a scene: Blocks and rows in, a quadratic program out."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, norm_over
+from tfeti_dolfinx.common.parallel import any_rank, largest, norm_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
@@ -22,14 +21,12 @@ from tfeti_dolfinx.feti.operator import (
     mean_stiffness,
     scaled_rows,
 )
-from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
-from tfeti_dolfinx.feti.projectors import FaceFactors
-from tfeti_dolfinx.feti.rigid_bodies import Motions, free_to_move, listed
+from tfeti_dolfinx.feti.preconditioner import Deflation, FacePreconditioners, MakeDeflation
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
-from tfeti_dolfinx.qp.problem import QP, FaceOperator, LastProduct, Operator
+from tfeti_dolfinx.qp.problem import QP, KnownProduct
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, FeasibleSet, Product, Status
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, FeasibleSet, Product
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -44,9 +41,6 @@ class DualLimits:
     # of stiffness, lengths and forces: below it squares leave the range of floating point
     least: float = 1e-130
     most: float = 1e130  # the same above
-    # motions held by less than this share of what the same contacts hold at most are nearly free:
-    # their contacts' normals are off by less than 6 degrees from a right angle
-    nearly: float = 1e-2
     parallel: float = 1e-12  # loads whose directions differ by less are held by the same contacts
     # directions kept where options do not say how many: later ones gain hardly anything, and each
     # takes two vectors
@@ -71,23 +65,6 @@ def contact_set(constraints: Constraints) -> FeasibleSet:
     return Product([normals, (sets.tangents.ravel(), Ellipses(constraints.limits))])
 
 
-class Deflation(Protocol):
-    """A coarse space of a preconditioner on faces."""
-
-    count: int  # number of its motions, of all subdomains
-    factors: FaceFactors  # makes the factors of faces, and counts them
-
-    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
-        """Return M_f, which is taken over, with these motions. Collective."""
-
-    def destroy(self) -> None:
-        """Free what belongs to it. Collective."""
-
-
-# from B, the natural coarse space, weights and a prefix of options
-MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, str], Deflation]
-
-
 class Dual:
     """F, G, d and e of a scene. Creation and all methods are collective.
 
@@ -109,10 +86,10 @@ class Dual:
         feasible: The set Ω of multipliers.
         pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
-        last: The last solution of block Newton, or without a kernel, with its image.
+        last: The last solution of block Newton, or without a kernel, with its image; ``solved`` are
+            d and e of its program.
         recycled: Directions of earlier solves; None: none are kept.
-        begin: Where the load step began, shape ``(n,)``; bodies that nothing holds stay near.
-        negligible: Displacements of bodies that count as none, shape ``(bodies,)``.
+        begin, negligible: As ``begin_solve`` has it.
     """
 
     def __init__(
@@ -134,8 +111,6 @@ class Dual:
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
-        self._prefix = f"{options_prefix}face_"
-        self._names = body_names, mode_names
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self._stiffness = largest(comm, subdomains.diagonal)
         self._set_linear_term(comm)
@@ -156,30 +131,34 @@ class Dual:
         self.late = self.preconditioner if isinstance(self.preconditioner, LateDirichlet) else None
         if self.preconditioner is not None and own and self.late is None:
             self._lifting = self.preconditioner.local
-        self._on_faces: FacePreconditioner | None = None
-        self._on_all: FaceOperator | None = None
-        self._on_last: tuple[Face, FaceOperator] | None = None
         self._held_load: Array | None = None
-        normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
-        prefix = f"{options_prefix}coarse_"
-        springs, sigma = constraints.sets.springs, 1.0
-        if not subdomains.num_springs:
-            springs = springs[:0]
-        else:
+        prefix, sigma = f"{options_prefix}coarse_", 1.0
+        if subdomains.num_springs:
             sigma = mean_stiffness(subdomains, constraints.weights)
             on_springs: Array = np.zeros(constraints.num_rows)
-            on_springs[springs] = 1.0
+            on_springs[constraints.sets.springs] = 1.0
             self.F.added = on_springs / sigma
             if self.preconditioner is not None:
                 self.preconditioner.added = sigma * on_springs
-        self.coarse = CoarseSpace(B, subdomains, normals, tangents, springs, sigma, prefix)
+        names = body_names, mode_names
+        self.coarse = CoarseSpace(constraints, subdomains, names, sigma, prefix)
         self.deflation: Deflation | None = None
-        if self.preconditioner is not None and deflation is not None:
-            self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
+        self._on_faces: FacePreconditioners | None = None
+        if self.preconditioner is not None:
+            if deflation is not None:
+                self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
+            self._on_faces = FacePreconditioners(
+                self.preconditioner,
+                constraints,
+                subdomains.diagonal,
+                f"{options_prefix}face_",
+                self.deflation,
+            )
         self.contact_rows = constraints.contact_rows
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
-        self.seen, self.last = 0.0, LastProduct()
+        self.seen, self.last = 0.0, KnownProduct()
+        self.solved: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self.begin: Array | float = 0.0
         self.negligible: Array | float = 0.0
         self.recycled: Recycled | None = None
@@ -210,7 +189,7 @@ class Dual:
             if not any_rank(comm, apart > LIMITS.parallel * size):
                 return
         self._held_load = None  # what holds a load holds its multiples, but for given limits
-        check_solvable(coarse, self._given, self.pulling, load, *self._names)
+        check_solvable(coarse, self._given, self.pulling, load)
         limited = len(self._given.pressed) < len(self._given.sets.tangents)
         if not any_rank(comm, limited or size == 0.0):
             self._held_load = load / size
@@ -275,8 +254,13 @@ class Dual:
             self.constraints = self._given.with_pressures(pressures)
         self.feasible = self.law(self.constraints)
 
-    def forget_counts(self) -> None:
-        """Count multiplications from 0 on."""
+    def begin_solve(self, begin: Array | float = 0.0, negligible: Array | float = 0.0) -> None:
+        """Count multiplications from 0 on, of a solve in a load step.
+
+        ``begin`` is where that began, shape ``(n,)``: bodies that nothing holds stay near;
+        ``negligible`` are displacements of bodies that count as none, shape ``(bodies,)``.
+        """
+        self.begin, self.negligible = begin, negligible
         for operator in (self.F, self.preconditioner):
             if operator is not None:
                 operator.count = 0
@@ -287,27 +271,23 @@ class Dual:
     def qp(self, norm_steps: int = 0) -> QP:
         """Return the quadratic program; without kernel it has no coarse problem.
 
-        ‖PFP‖ is estimated once, by so many Lanczos steps; 0 where nobody asks for it.
+        ‖PFP‖ is estimated once, by so many Lanczos steps; 0: not at all.
         """
         self.feasible = self.law(self.constraints)  # c may be another, and what the law refers to
         if norm_steps and norm_steps not in self._norms:
             before = self.F.count
             self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)
             self.norm_count, self.F.count = self.F.count - before, before
-        norm = self._norms.get(norm_steps, 1.0)
-        on = self._preconditioner_on if self.preconditioner is not None else None
+        on = self._on_faces
         return QP(
             self.F,
             self.d,
             self.coarse,
             self.feasible,
-            preconditioner=self._on_all_rows,
-            norm=norm,
-            preconditioner_on=on,
-            seen=self.seen,
+            preconditioner=None if on is None else on.on_all_rows(),
+            norm=self._norms.get(norm_steps, self.seen),
+            preconditioner_on=None if on is None else on.on_face,
             recycled=self.recycled,
-            keeps="kept_directions" not in self._without,
-            cautious="cautious" not in self._without,
             sprung=self.subdomains.num_springs > 0,
             rough=self.rough,
             foundation=None if "foundation" in self._without else self.foundation,
@@ -325,42 +305,6 @@ class Dual:
             sigma *= LIMITS.stiffer
         softer = count ** (1.0 / max(self._dimension - 1, 1))
         return np.asarray(-sigma / softer * self.constraints.c)
-
-    @property
-    def _on_all_rows(self) -> Operator | None:
-        """Return the preconditioner on all rows, made once."""
-        given = self.preconditioner
-        smooths = given is not None and (given is self.late or given.metric is not None)
-        count = 0 if self.deflation is None else self.deflation.count
-        if not (count or (smooths and not any(self.contact_rows))):
-            return self.preconditioner
-        if self._on_all is None:
-            rows = self.constraints.num_rows
-            face = Face(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
-            self._on_all = self._made_on(face)
-        return self._on_all
-
-    def _preconditioner_on(self, face: Face) -> FaceOperator:
-        """Return the preconditioner on a face, that of the last time if it is that face."""
-        if self._on_last is not None:
-            known, operator = self._on_last
-            if not any_rank(self.coarse.comm, not face.is_like(known)):
-                return operator
-            self._on_last = None
-            operator.destroy()
-        self._on_last = face, self._made_on(face)
-        return self._on_last[1]
-
-    def _made_on(self, face: Face) -> FaceOperator:
-        """Make the preconditioner on a face; parts that all faces share are made once."""
-        assert self.preconditioner is not None
-        if self._on_faces is None:
-            diagonal = self.subdomains.diagonal
-            self._on_faces = FacePreconditioner(
-                self.preconditioner, self.constraints, diagonal, self._prefix
-            )
-        made = self._on_faces.on_face(face)
-        return made if self.deflation is None else self.deflation.balanced(face, made)
 
     @property
     def driving(self) -> Array:
@@ -382,43 +326,19 @@ class Dual:
         if 0.0 < norm_over(comm, lam) <= LIMITS.far * norm_over(comm, least):
             return False
         known = coarse.combined(mu) if len(mu) == coarse.dimension else least
-        Fx = self.last.image(self.F, comm, lam).Fx
-        self.last.x, self.last.Fx, self.last.within = lam, Fx, 0.0
+        Fx = self.last.image(self.F, comm, lam)
+        self.last = KnownProduct(lam, Fx)
         lengths = norm_over(comm, known) + norm_over(comm, Fx)
         return lengths > LIMITS.far * norm_over(comm, self.driving)
 
-    def nearly_free(self, loose: Motions) -> list[dict[str, Any]]:
-        """List motions of those that contact rows hold hardly or not, see ``listed``."""
-        if not self.coarse.unheld.free.any():  # conditions hold all bodies: contact need not
-            return []
-        hardly = replace(loose, free=loose.stiffness <= LIMITS.nearly)
-        return bcast_from_root(self.coarse.comm, listed(hardly, self.coarse.bodies, *self._names))
-
-    def sliding(self, motion: Array) -> tuple[str, Array]:
-        """Return a sentence on a motion of bodies, and local rows of friction that slip most."""
-        coarse, slip = self.coarse, np.zeros(len(self.d))
-        slip[coarse.rubbing] = np.abs(coarse.J @ motion)[coarse.rubbing]
-        most = np.flatnonzero(slip > 0.5 * largest(coarse.comm, slip))
-        return free_to_move(coarse.bodies.amounts(motion), *self._names), most
-
-    def moves_rigidly(self, u: Array, bends: float) -> str:
-        """Return a sentence on the bodies that move most, but for less than a share bends, or "".
-
-        Collective; u on all unknowns.
-        """
-        subdomains, bodies = self.subdomains, self.coarse.bodies
-        amounts = bodies.amounts(bodies.part_of(u))
-        sizes = subdomains.body_sizes([u, u - subdomains.modes_motion(amounts)])
-        moved, bent = bcast_from_root(subdomains.comm, sizes)
-        rigid = (bent <= bends * moved) & (moved >= 0.5 * moved.max(initial=0.0))
-        if not np.any(rigid):
-            return ""
-        return free_to_move(np.where(rigid[:, None], amounts, 0.0), *self._names)
+    def know(self, lam: Array, image: Array) -> None:
+        """Take Fλ of another run, if some rank has it. Collective."""
+        if any_rank(self.coarse.comm, image.size > 0):
+            self.last = KnownProduct(lam, image)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
-        last = None if self._on_last is None else self._on_last[1]
-        own = (last, self._on_all, self._on_faces, self.deflation, self.preconditioner)
-        for item in (self.F, *own, self._scaled):
+        own = (self.F, self._on_faces, self.deflation, self.preconditioner, self._scaled)
+        for item in own:
             if item is not None:
                 item.destroy()

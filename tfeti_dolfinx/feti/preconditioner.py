@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from petsc4py import PETSc
@@ -11,13 +12,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from tfeti_dolfinx.common.arrays import Array, Entries, LocalMatrix
-from tfeti_dolfinx.common.parallel import bcast_from_root, largest, rows_over
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, rows_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.feti.coarse import side_by_side
+from tfeti_dolfinx.feti.coarse import CoarseSpace, side_by_side
 from tfeti_dolfinx.feti.operator import DualOperator, LateDirichlet, Metric
-from tfeti_dolfinx.qp.problem import FaceOperator
-from tfeti_dolfinx.qp.sets import Face
+from tfeti_dolfinx.feti.projectors import FaceFactors
+from tfeti_dolfinx.qp.problem import FaceOperator, Operator
+from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, has_solver
 
 OfArray = Callable[[Array], Array]
@@ -265,6 +267,85 @@ def _contact_gram(B: PETSc.Mat, B_D: PETSc.Mat, contact: Array) -> PETSc.Mat | N
         gram.destroy()
         return None
     return gram
+
+
+# --- Preconditioners on faces -----------------------------------------------------------------
+
+
+class Deflation(Protocol):
+    """A coarse space of a preconditioner on faces."""
+
+    count: int  # number of its motions, of all subdomains
+    factors: FaceFactors  # makes the factors of faces, and counts them
+
+    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
+        """Return M_f, which is taken over, with these motions. Collective."""
+
+    def destroy(self) -> None:
+        """Free what belongs to it. Collective."""
+
+
+# from B, the natural coarse space, weights and a prefix of options
+MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, str], Deflation]
+
+
+class FacePreconditioners:
+    """M_f of a ``FacePreconditioner`` on one face after the other, with a coarse space if given.
+
+    Those of all rows and of the last face are kept. Creation is not collective, all methods are.
+    """
+
+    def __init__(
+        self,
+        whole: DualOperator,
+        constraints: Constraints,
+        diagonal: Array,
+        prefix: str,
+        deflation: Deflation | None,
+    ) -> None:
+        self._whole, self._constraints, self._deflation = whole, constraints, deflation
+        self._diagonal, self._prefix = diagonal, prefix
+        self._comm = constraints.B.getComm().tompi4py()
+        self._shared: FacePreconditioner | None = None
+        self._on_all: FaceOperator | None = None
+        self._last: tuple[Face, FaceOperator] | None = None
+
+    def on_all_rows(self) -> Operator:
+        """Return M on all rows: itself where it has no coarse space, and smooths nothing there."""
+        smooths = isinstance(self._whole, LateDirichlet) or self._whole.metric is not None
+        count = 0 if self._deflation is None else self._deflation.count
+        if not (count or (smooths and not any(self._constraints.contact_rows))):
+            return self._whole
+        if self._on_all is None:
+            rows = self._constraints.num_rows
+            self._on_all = self._made(Face(np.ones(rows, dtype=bool), np.full(rows, Status.FREE)))
+        return self._on_all
+
+    def on_face(self, face: Face) -> FaceOperator:
+        """Return M_f, that of the last time if it is that face."""
+        if self._last is not None:
+            known, operator = self._last
+            if not any_rank(self._comm, not face.is_like(known)):
+                return operator
+            self._last = None
+            operator.destroy()
+        self._last = face, self._made(face)
+        return self._last[1]
+
+    def _made(self, face: Face) -> FaceOperator:
+        """Make M_f; parts that all faces share are made once."""
+        if self._shared is None:
+            self._shared = FacePreconditioner(
+                self._whole, self._constraints, self._diagonal, self._prefix
+            )
+        made = self._shared.on_face(face)
+        return made if self._deflation is None else self._deflation.balanced(face, made)
+
+    def destroy(self) -> None:
+        """Destroy what was made, not the operator on all rows nor the coarse space."""
+        for item in (self._last and self._last[1], self._on_all, self._shared):
+            if item is not None:
+                item.destroy()
 
 
 # --- Chebyshev steps --------------------------------------------------------------------------

@@ -67,7 +67,8 @@ class Grams:
             G_f = G[face.free[rows]]
             sums[places] += (G_f.T @ G_f).ravel()
         sums[-2:] = np.any(face.status[self._always] != Status.FREE), len(face.tangents)
-        *_, others, tangents = summed(self.comm, sums)
+        sums = summed(self.comm, sums)
+        others, tangents = sums[-2:]
         if others:
             along = face.Z.T @ self.Gt
             gram = replicated(along.T.tocsr() @ along, self.comm)
@@ -166,8 +167,7 @@ class SemidefiniteFactor:
         what: str,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.comm, self._null = comm, null
-        self._scale, pinned = _scaling(A, null)
+        self._null, (self._scale, pinned) = null, _scaling(A, null)
         scaled = _scaled(A, self._scale, pinned)
         self._factor: CholeskyFactor | None = None
         self._shift = 0.0

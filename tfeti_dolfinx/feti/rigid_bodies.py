@@ -48,6 +48,9 @@ class MotionTolerances:
     # another centre mixes in
     dominant: float = 0.3
     named: int = 4  # bodies that a sentence names; of more it tells how many
+    # of the stiffest motion of the same body: a stiffness that hardly holds one, by contacts whose
+    # normals are off by less than 6 degrees from a right angle
+    nearly: float = 1e-2
 
 
 TOLERANCES = MotionTolerances()
@@ -202,7 +205,17 @@ class BodyRows:
 
 @dataclass(frozen=True)
 class Motions:
-    """A space of motions of bodies, each of k coordinates."""
+    """A space of motions of bodies, each of k coordinates.
+
+    These are used, from the largest to the smallest:
+
+    ============================  =============================================================
+    ``Bodies.unsprung``           not resisted by springs that stiffnesses have
+    ``CoarseSpace.unheld``        nor by equality rows, soft springs among them: what contact holds
+    ``Recovered.loose``           nor by a row of contact with a force, at an iterate
+    ``CoarseSpace.free_motions``  nor by any row
+    ============================  =============================================================
+    """
 
     single: Array  # orthonormal directions of each body, as columns, shape (bodies, k, k)
     free: Array  # which of them the body can take alone, shape (bodies, k)
@@ -336,6 +349,7 @@ class Bodies:
     Creation is collective.
 
     Attributes:
+        names: Their names, and ``mode_names`` those of the candidate modes, for messages.
         count: Number of bodies on all ranks.
         k: Candidate modes of each.
         frames: Modes' coefficients of each coordinate, shape ``(bodies, k, k)``.
@@ -347,8 +361,11 @@ class Bodies:
             and ``unloaded``, that is its own rounding; shape ``(bodies,)``.
     """
 
-    def __init__(self, subdomains: Subdomains) -> None:
+    def __init__(
+        self, subdomains: Subdomains, names: Sequence[str], mode_names: Sequence[str]
+    ) -> None:
         self._subdomains, comm = subdomains, subdomains.comm
+        self.names, self.mode_names = names, mode_names
         self.count, self.k = subdomains.num_bodies, subdomains.num_modes
         metric = subdomains.modes_metric()
         self.nodes = metric[:, :1, :1].max(axis=(1, 2), initial=1.0)
@@ -408,6 +425,68 @@ class Bodies:
     def amounts(self, motion: Array) -> Array:
         """Return the coefficient of each mode in a motion, shape ``(bodies, k)``."""
         return np.einsum("bij,bj->bi", self.frames, motion.reshape(self.count, self.k))
+
+    # --- what messages say of motions
+
+    def sentence(self, amounts: Array) -> str:
+        """Return a sentence about a motion, from how much of each mode is in it."""
+        moving, modes = self._parts(amounts)
+        if len(moving) == 1:
+            return f"{self.names[moving[0]]} is free to move ({modes})"
+        rest = len(moving) - TOLERANCES.named
+        names = ", ".join(self.names[b] for b in moving[: TOLERANCES.named])
+        more = f" and {rest} more" if rest > 0 else ""
+        return f"{names}{more} are free to move together ({modes})"
+
+    def moved_rigidly(self, u: Array, bends: float) -> str:
+        """Return a sentence on the bodies that move most, but for less than a share bends, or "".
+
+        Collective; u on all unknowns.
+        """
+        amounts = self.amounts(self.part_of(u))
+        sizes = self._subdomains.body_sizes([u, u - self._subdomains.modes_motion(amounts)])
+        moved, bent = bcast_from_root(self._subdomains.comm, sizes)
+        rigid = (bent <= bends * moved) & (moved >= 0.5 * moved.max(initial=0.0))
+        return self.sentence(np.where(rigid[:, None], amounts, 0.0)) if np.any(rigid) else ""
+
+    def listed(self, motions: Motions) -> list[dict[str, Any]]:
+        """List motions: ``bodies``, ``mode`` and the ``stiffness`` that holds them, 0 for none.
+
+        Of several free motions of the same bodies any combination is one, too: such are named of
+        which each has a coordinate that the others leave alone.
+        """
+        found: list[dict[str, Any]] = []
+
+        def add(which: Sequence[int], columns: Array, stiffness: float) -> None:
+            if stiffness == 0.0:
+                columns = columns @ np.linalg.inv(columns[np.sort(independent(columns))])
+            for motion in columns.T:
+                moving, mode = self._parts(motion.reshape(len(which), self.k))
+                names = [self.names[which[b]] for b in moving]
+                found.append({"bodies": names, "mode": mode, "stiffness": stiffness})
+
+        for body in np.flatnonzero(motions.free.any(axis=1)):
+            vectors = self.frames[body] @ motions.single[body]
+            own, held = motions.free[body], motions.stiffness[body]
+            loose = own & (held <= TOLERANCES.null)
+            add([body], vectors[:, loose], 0.0)
+            for j in np.flatnonzero(own & ~loose):
+                add([body], vectors[:, [j]], float(held[j]))
+        for _, rows, joint in parts_of_columns(motions.joint):
+            which, place = np.unique(rows // self.k, return_inverse=True)
+            coordinates = np.zeros((len(which), self.k, joint.shape[1]))
+            coordinates[place, rows % self.k] = joint
+            amounts = self.frames[which] @ coordinates
+            add(which, amounts.reshape(-1, joint.shape[1]), 0.0)
+        return found
+
+    def _parts(self, amounts: Array) -> tuple[Array, str]:
+        """Return the bodies that take part in a motion, and its dominant mode."""
+        parts = np.abs(amounts)
+        moving = np.flatnonzero(parts.max(axis=1) > TOLERANCES.takes_part * parts.max())
+        share = parts[moving].max(axis=0)
+        dominant = np.flatnonzero(share > TOLERANCES.dominant * share.max())
+        return moving, " and ".join(self.mode_names[m] for m in dominant)
 
 
 # --- Basis of the kernel with the bodies' motions ---------------------------------------------
@@ -493,60 +572,3 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     )
     unheld_of, free_of = kept & (values < -0.5), kept & (values < -1.5)
     return KernelBasis(directions, kept, unheld_of, free_of, motions, coordinates, rest)
-
-
-# --- Names of motions in messages -------------------------------------------------------------
-
-
-def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
-    """Return a sentence about a motion, from how much of each mode is in it."""
-    moving, modes = _parts(amounts, mode_names)
-    if len(moving) == 1:
-        return f"{body_names[moving[0]]} is free to move ({modes})"
-    rest = len(moving) - TOLERANCES.named
-    names = ", ".join(body_names[b] for b in moving[: TOLERANCES.named])
-    more = f" and {rest} more" if rest > 0 else ""
-    return f"{names}{more} are free to move together ({modes})"
-
-
-def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
-    """Return the bodies that take part in a motion, and its dominant mode."""
-    parts = np.abs(amounts)
-    moving = np.flatnonzero(parts.max(axis=1) > TOLERANCES.takes_part * parts.max())
-    share = parts[moving].max(axis=0)
-    dominant = np.flatnonzero(share > TOLERANCES.dominant * share.max())
-    return moving, " and ".join(mode_names[m] for m in dominant)
-
-
-def listed(
-    motions: Motions, bodies: Bodies, body_names: Sequence[str], mode_names: Sequence[str]
-) -> list[dict[str, Any]]:
-    """List motions: ``bodies``, ``mode`` and the ``stiffness`` that holds them, 0 for none.
-
-    Of several free motions of the same bodies any combination is one, too: such are named of which
-    each has a coordinate that the others leave alone.
-    """
-    found: list[dict[str, Any]] = []
-
-    def add(which: Sequence[int], columns: Array, stiffness: float) -> None:
-        if stiffness == 0.0:
-            columns = columns @ np.linalg.inv(columns[np.sort(independent(columns))])
-        for motion in columns.T:
-            moving, mode = _parts(motion.reshape(len(which), bodies.k), mode_names)
-            names = [body_names[which[b]] for b in moving]
-            found.append({"bodies": names, "mode": mode, "stiffness": stiffness})
-
-    for body in np.flatnonzero(motions.free.any(axis=1)):
-        vectors = bodies.frames[body] @ motions.single[body]
-        own, held = motions.free[body], motions.stiffness[body]
-        loose = own & (held <= TOLERANCES.null)
-        add([body], vectors[:, loose], 0.0)
-        for j in np.flatnonzero(own & ~loose):
-            add([body], vectors[:, [j]], float(held[j]))
-    for _, rows, joint in parts_of_columns(motions.joint):
-        which, place = np.unique(rows // bodies.k, return_inverse=True)
-        coordinates = np.zeros((len(which), bodies.k, joint.shape[1]))
-        coordinates[place, rows % bodies.k] = joint
-        amounts = bodies.frames[which] @ coordinates
-        add(which, amounts.reshape(-1, joint.shape[1]), 0.0)
-    return found

@@ -14,7 +14,6 @@ from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.feti.rigid_bodies import free_to_move
 
 
 @dataclass(frozen=True)
@@ -181,12 +180,7 @@ def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
 
 
 def check_solvable(
-    coarse: CoarseSpace,
-    constraints: Constraints,
-    pulling: Array,
-    load: Array,
-    body_names: Sequence[str],
-    mode_names: Sequence[str],
+    coarse: CoarseSpace, constraints: Constraints, pulling: Array, load: Array
 ) -> None:
     """Raise if the load moves a body that neither contact nor friction can hold. Collective.
 
@@ -205,7 +199,7 @@ def check_solvable(
                 found = _explained(scene, coarse, constraints.sets.tangents.shape[1])
         motion, reason = bcast_from_root(coarse.comm, found) or (None, reason)
     if motion is not None:
-        words = free_to_move(coarse.bodies.amounts(motion), body_names, mode_names)
+        words = coarse.bodies.sentence(coarse.bodies.amounts(motion))
         raise NoSolutionError(f"{words}: {reason}")
 
 

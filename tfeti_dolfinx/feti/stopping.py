@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
-from tfeti_dolfinx.common.parallel import steering
+from tfeti_dolfinx.common.parallel import steering, summed
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import energy_bound, within
@@ -115,8 +115,7 @@ def measure(
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     d = dual.d
     held_d, held_F = (x[face.holding] for x in (d, state.residual + d))
-    squares = np.array([x @ x for x in (state.lam, held_d, held_F)])
-    comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
+    squares = summed(comm, np.array([x @ x for x in (state.lam, held_d, held_F)]))
     multipliers, *sizes = np.sqrt(squares)
     # 2. its correction
     closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))

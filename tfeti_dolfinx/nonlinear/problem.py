@@ -308,7 +308,7 @@ class NonlinearContactProblem(ContactProblem):
                 f"its residual; along the last step they differ by {off / size:.1e} of J"
             )
         moved = self._system.subdomains.with_rigid(self.dofs.to_primal(d))
-        if words := self._system.dual.moves_rigidly(moved, tol.bends):
+        if words := self._system.dual.coarse.bodies.moved_rigidly(moved, tol.bends):
             return (
                 f"{words}, or contact hardly resists that; add a Dirichlet condition, a spring or "
                 "friction, or take smaller load steps"

@@ -147,22 +147,3 @@ def imbalance(coarse: Coarse, x: Array) -> float:
     floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
     own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)
     return bcast_from_root(coarse.comm, float(own))
-
-
-class DenseCoarse(Coarse):
-    """A constraint from a dense G, for a program on one rank. Shapes ``(r, m)`` and ``(r,)``."""
-
-    def __init__(self, G: Array, e: Array) -> None:
-        inverse = np.linalg.pinv(G @ G.T, hermitian=True)
-        super().__init__(MPI.COMM_SELF, csr_array(G.T), e, inverse.__matmul__)
-
-    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
-        G_f = face.restricted(Gt := self.Gt.toarray())
-        return np.linalg.pinv(Gt.T @ G_f + damping * Gt.T @ Gt, hermitian=True) @ y
-
-    def on_face(self, face: Face) -> Coarse:
-        """Return the same G on a face."""
-        G_f = face.restricted(self.Gt.toarray())
-        inverse = np.linalg.pinv(G_f.T @ G_f, hermitian=True)
-        return Coarse(self.comm, self.Gt, self.e, inverse.__matmul__, face)

@@ -11,7 +11,6 @@ from tfeti_dolfinx.qp.problem import (
     QP,
     STRANGE,
     ConvergedReason,
-    Homogenised,
     Monitor,
     Operator,
     Point,
@@ -72,9 +71,8 @@ class PcpgParameters:
     # gradients begin anew
     drifted: float = 0.5
     short: float = 1e-6  # of λ: a way that is shorter may be rounding of Gλ = e
-
-
-DEFAULT = PcpgParameters()
+    # whether a direction is made conjugate to all before it, not to the last alone
+    keeps: bool = True
 
 
 class Directions:
@@ -85,18 +83,19 @@ class Directions:
         p: The last direction.
         fresh: Whether the next direction is the first.
         kept: Directions, and what PF makes of them, that the next one is made conjugate to: with
-            ``keeps`` all that memory lasts for. In exact arithmetic it is conjugate to all if it is
-            to the last one; rounding undoes that where F is ill conditioned on a face (Farhat,
-            Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
+            ``parameters.keeps`` all that memory lasts for. In exact arithmetic it is conjugate to
+            all if it is to the last one; rounding undoes that where F is ill conditioned on a face
+            (Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
         norm: Largest Rayleigh quotient of F that a direction has shown; at most ‖PFP‖.
         helped: Largest rᵀz/rᵀr so far.
     """
 
-    def __init__(self, qp: QP) -> None:
+    def __init__(self, qp: QP, parameters: PcpgParameters = PcpgParameters()) -> None:
+        self.parameters = parameters
         self.r, self.p = np.zeros(len(qp.d)), np.zeros(len(qp.d))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
         rows = int(largest(qp.coarse.comm, np.array([len(qp.d)])))
-        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if qp.keeps else 1
+        most = max(parameters.numbers // (2 * max(rows, 1)), 1) if parameters.keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
@@ -106,7 +105,7 @@ class Directions:
         """
         if not short:
             self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
-        return pFp > DEFAULT.flat * self.norm * pp
+        return pFp > self.parameters.flat * self.norm * pp
 
 
 # --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
@@ -120,14 +119,14 @@ def pcpg(
     max_it: int,
     monitor: Monitor = no_monitor,
     directions: Directions | None = None,
-) -> ConvergedReason:
-    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a point on and in place. Collective.
+) -> tuple[Point, ConvergedReason]:
+    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a point on. Collective.
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone; the feasible set is kept by
     nobody. Multiplies by F, and by the preconditioner, once per step. A step makes three global
     reductions: one with each projection, one for the norm of the residual; one more where there are
-    directions of earlier solves.
+    directions of earlier solves. Return the end, and why it is one.
 
     ===========================  ===================================================
     reason                       when
@@ -141,16 +140,17 @@ def pcpg(
     left.
     """
     own, comm = Directions(qp) if directions is None else directions, qp.coarse.comm
-    recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
+    given = own.parameters
+    recycled, (point, past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
-    least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
+    least = given.short**2 * qp.dot((point.lam, point.lam))[0]
     while True:
         # test
         small = norm <= rule.tolerance
         reason = _examined(qp, point, rule, norm) if small else ConvergedReason.ITERATING
         if small and reason == ConvergedReason.ITERATING and qp.rough is not None:
-            point.g = point.g if rule.gradient is None else rule.gradient
-            past, norm = _begun(qp, point, own)
+            point = point if rule.gradient is None else Point(point.lam, rule.gradient)
+            point, past, norm = _begun(qp, point, own)
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -177,42 +177,41 @@ def pcpg(
         squared, rz, rp, pFp = summed(comm, np.array([left @ left, *known]))
         short = bool(pFp) and (rp / pFp) ** 2 * pp < least
         own.helped = max(own.helped, rz / norm**2 if norm > 0.0 else 0.0)
-        if not (own.seen(pFp, pp, short) and rz > DEFAULT.flat * own.helped * norm**2):
+        if not (own.seen(pFp, pp, short) and rz > given.flat * own.helped * norm**2):
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
-        point.lam, point.g = point.lam + rp / pFp * p, point.g + rp / pFp * Fp
+        point = Point(point.lam + rp / pFp * p, point.g + rp / pFp * Fp)
         kept.put(p / np.sqrt(pFp), PFp / np.sqrt(pFp))
         if recycled is not None:
             new = [*new[1 - recycled.capacity :], (p, Fp, pFp)]
         own.r = left
-        drifts, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
+        drifts, norm = abs(rp - rz) > given.drifted * rz, float(np.sqrt(squared))
         # images of earlier solves are too inexact where r is not even orthogonal to a first p
         past, own.fresh = None if drifts and own.fresh else past, drifts
         steps.cg += 1
         monitor(steps, "cg", point.lam, norm, 0.0)
     for direction in new:
         recycled.add(*direction)  # type: ignore[union-attr]
-    return reason
+    return point, reason
 
 
 def solve_by_pcpg(
     qp: QP,
-    homogenised: Homogenised,
+    start: Start,
     rule: StoppingRule,
-    parameters: PcpgParameters = DEFAULT,
+    parameters: PcpgParameters = PcpgParameters(),
     *,
     max_it: int = 10_000,
-    start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
     """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
 
     Stops as ``pcpg`` does; with ``DIVERGED_ROUNDING`` where residuals are rounding, too, and a
-    direction has no positive curvature. Inequalities are not looked at, nor is ``start`` beside λ̄.
+    direction has no positive curvature. Inequalities are not looked at, nor is an earlier λ.
 
     >>> import numpy as np
-    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.testing import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Product
     >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, 1.0, 2.0])
@@ -221,12 +220,13 @@ def solve_by_pcpg(
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
     """
-    point, steps = Point(homogenised.lam_bar, homogenised.gradient), Steps()
-    monitor(steps, "start", point.lam, norm_over(qp.coarse.comm, homogenised.b), 0.0)
-    reason = pcpg(qp, point, rule, steps, max_it, monitor)
+    steps = Steps()
+    monitor(steps, "start", start.at.lam, norm_over(qp.coarse.comm, start.b), 0.0)
+    directions = Directions(qp, parameters)
+    point, reason = pcpg(qp, start.at, rule, steps, max_it, monitor, directions)
     g = qp.coarse.project(point.g)
     norm = norm_over(qp.coarse.comm, g)
-    rounds = norm <= STRANGE * homogenised.rounding
+    rounds = norm <= STRANGE * start.rounding
     if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and rounds:
         reason = ConvergedReason.DIVERGED_ROUNDING
     return QPResult(
@@ -236,29 +236,30 @@ def solve_by_pcpg(
         face=qp.feasible.face(point.lam, g),
         reason=reason,
         projected_gradient=norm,
-        equality=qp.coarse.norm_Q(point.lam - homogenised.lam_bar),
-        reference=homogenised.reference,
+        equality=qp.coarse.norm_Q(point.lam - start.at.lam),
+        reference=start.reference,
         norm=0.0,
         steps=steps,
     )
 
 
 def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
-    """Apply the stopping rule to the point."""
+    """Apply the stopping rule to the point; what ‖F‖ is nothing tells."""
     face = qp.feasible.face(point.lam, point.g)
-    return rule.examine(point.lam, point.g, face, norm, qp.norm)
+    return rule.examine(point.lam, point.g, face, norm, 0.0)
 
 
-def _begun(qp: QP, point: Point, own: Directions) -> tuple[Along | None, float]:
-    """Minimise q over directions of earlier solves; return steps along them, and ‖r‖, r = −P g.
+def _begun(qp: QP, point: Point, own: Directions) -> tuple[Point, Along | None, float]:
+    """Minimise q over directions of earlier solves; return where, steps along them, and ‖P g‖.
 
     Projected twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
     """
-    project, past = qp.coarse.project, None
+    project, recycled, past = qp.coarse.project, qp.recycled, None
+    held = None if qp.coarse.face is None else qp.coarse.face.held
     own.r = project(project(-point.g))
-    if qp.recycled is not None and (past := qp.recycled.on_face(qp.held)) is not None:
-        way, b = past(own.r, qp.recycled.directions)
+    if recycled is not None and (past := recycled.on_face(held)) is not None:
+        way, b = past(own.r, recycled.directions)
         # rounding of many directions is none of Gλ = e
-        point.lam, point.g = point.lam + project(way), point.g + qp.recycled.images.T @ b
+        point = Point(point.lam + project(way), point.g + recycled.images.T @ b)
         own.fresh, own.r = True, project(project(-point.g))
-    return past, norm_over(qp.coarse.comm, own.r)
+    return point, past, norm_over(qp.coarse.comm, own.r)

@@ -10,11 +10,10 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import any_rank, count_over, largest, least, norm_over, steering
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
-from tfeti_dolfinx.qp.krylov import Directions, pcpg
+from tfeti_dolfinx.qp.krylov import Directions, PcpgParameters, pcpg
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
-    Homogenised,
     Monitor,
     Point,
     QPResult,
@@ -76,6 +75,10 @@ class NewtonParameters:
     far: float = 1e30  # how far such a direction is followed, to end in Ω's cone of recession
     unseen: float = 1e-14  # of ‖F‖‖w‖: what may be left of Fw where F is not to see a direction w
     purifying: int = 200  # most steps of PCPG to that
+    # whether rows leave a face one by one after a step in which all together have raised q, or
+    # two in which what was left did not balance the load
+    cautious: bool = True
+    pcpg: PcpgParameters = PcpgParameters()  # those of solves on faces
 
 
 # --- Step 0: start ----------------------------------------------------------------------------
@@ -128,7 +131,7 @@ def _on_foundation(qp: QP, max_it: int = 20, alike: float = 0.1, roughly: float 
     return project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count), alpha)[0]
 
 
-def feasible_start(qp: QP, start: Start) -> Array:
+def feasible_start(qp: QP, lam: Array) -> Array:
     """Step 0: the nearest feasible point to earlier multipliers, or the first. Collective.
 
     What was open stays open, if the others can restore Gλ = e: else each would carry a little.
@@ -136,8 +139,7 @@ def feasible_start(qp: QP, start: Start) -> Array:
     has so many kinks that the projection may end before. Where a load grows, cλ, whose image is
     known, is in its place if it is feasible and about as near to λ.
     """
-    lam, coarse = start.lam, qp.coarse
-    on = qp.feasible.project(lam)
+    coarse, on = qp.coarse, qp.feasible.project(lam)
     for within in (WithinFace(qp.feasible, qp.feasible.face(on, -on)), qp.feasible):
         found, _ = project_onto_feasible(coarse, within, lam)
         if imbalance(coarse, found) <= UNBALANCED:
@@ -208,6 +210,7 @@ class NewtonIteration:
         since: So many have not found ‖g^P‖ half of ``least``.
         unbalanced: Whether the last end of step 3 was outside of Ω or did not fulfil Gλ = e.
         resume: Whether λ is where PCPG has stopped.
+        cautious: Whether rows leave as they block, after q rose, or two ends did not balance.
     """
 
     def __init__(
@@ -218,7 +221,8 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
         self.pressed = qp.feasible.face(z.lam, z.g)
         self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.since, self.resume, self.unbalanced = 0, 0, False, False
+        self.idle, self.since = 0, 0
+        self.resume = self.unbalanced = self.cautious = False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
@@ -296,7 +300,8 @@ class NewtonIteration:
         self.resume = taken
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
         unbalanced, self.unbalanced = self.unbalanced and not feasible, not feasible
-        self.solver.cautious = self.qp.cautious and (unbalanced or (rose and self.idle < 2))
+        early = unbalanced or (rose and self.idle < 2)
+        self.cautious = self.parameters.cautious and early
         if taken:
             self._go(end, 0.5 * double)
         if not taken and not looked:
@@ -337,7 +342,6 @@ class FaceSolver:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
-        cautious: Whether rows leave as they block, after q rose, or two ends did not balance.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -352,22 +356,22 @@ class FaceSolver:
     ) -> None:
         self._qp, self._rule, self._parameters = qp, rule, parameters
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
-        self.directions = Directions(qp)
-        self.directions.norm = qp.seen
+        self.directions = Directions(qp, parameters.pcpg)
+        self.directions.norm = qp.norm
         self._face: Face | None = None
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
-        self._status, self.cautious, self.rounds = np.zeros(len(qp.d)), False, 0
+        self._status, self.rounds = np.zeros(len(qp.d)), 0
         self.excluding: Array | None = None
         self.left = np.inf
 
     def solve(
-        self, start: Point, face: Face, optimality: float, resume: bool
+        self, start: Point, face: Face, optimality: float, resume: bool, cautious: bool
     ) -> tuple[Point, bool]:
         """Step 3: solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
         ‖g^P‖ is that at the start, a feasible point of the face; ``resume``: PCPG has stopped
-        there, and goes on if the face stays. Return where PCPG ended on the last face, and whether
-        that is in Ω and fulfils Gλ = e.
+        there, and goes on if the face stays; ``cautious``: rows leave as they block. Return where
+        PCPG ended on the last face, and whether that is in Ω and fulfils Gλ = e.
         """
         z, stays, self.rounds = start, self._enter(face) and resume, 0
         while True:
@@ -380,7 +384,7 @@ class FaceSolver:
             out, stays = self._has_left(end), False
             if not out or self._steps.cg >= self._max_it:
                 break
-            if self.cautious:
+            if cautious:
                 z = self._blocked(z, end)
                 continue
             if (restored := self._restored(end)) is None:
@@ -409,7 +413,7 @@ class FaceSolver:
         self._face, self._status = face, face.status
         self._curved = any_rank(qp.coarse.comm, slips)
         self.coarse = qp.coarse.on_face(face)
-        self._on_face = replace(qp, coarse=self.coarse, held=face.held, preconditioner=None)
+        self._on_face = replace(qp, coarse=self.coarse, preconditioner=None)
         if self._curved:
             F, bend = qp.roughly, face.bend
             self._on_face = replace(
@@ -482,9 +486,9 @@ class FaceSolver:
         qp, given = self._qp, self._parameters
         exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
         program = replace(self._on_face, F=qp.F, rough=None, d=Fw, recycled=None)
-        point, own = Point(np.zeros(len(way)), -Fw), Directions(replace(qp, keeps=True))
-        pcpg(program, point, StoppingRule(exact), Steps(), given.purifying, directions=own)
-        return way - point.lam, -point.g
+        zero, own = Point(np.zeros(len(way)), -Fw), Directions(qp)
+        end, _ = pcpg(program, zero, StoppingRule(exact), Steps(), given.purifying, directions=own)
+        return way - end.lam, -end.g
 
     def _pcpg(self, z: Point, optimality: float, resume: bool) -> tuple[Point, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
@@ -496,12 +500,11 @@ class FaceSolver:
         share = given.stage if resume else given.reduction
         target = share * min(norm_over(qp.coarse.comm, self.coarse.project(z.g)), optimality)
         lowest = 0.0 if self._rule.waits else given.final * self._rule.tolerance
-        rule = StoppingRule(max(target, lowest))
-        end, norm = Point(z.lam, z.g), own.norm
-        reason = pcpg(self._on_face, end, rule, self._steps, self._max_it, self._monitor, own)
+        rule, norm = StoppingRule(max(target, lowest)), own.norm
+        end, reason = pcpg(self._on_face, z, rule, self._steps, self._max_it, self._monitor, own)
         self.left = norm_over(qp.coarse.comm, own.r)
         if self._curved:
-            end.g = end.g - face.bend(end.lam - z.lam)
+            end = Point(end.lam, end.g - face.bend(end.lam - z.lam))
             own.norm = norm  # small circles bend far more than F does
         return end, reason != ConvergedReason.CONVERGED_RTOL and self._steps.cg < self._max_it
 
@@ -511,12 +514,11 @@ class FaceSolver:
 
 def newton(
     qp: QP,
-    homogenised: Homogenised,
+    start: Start,
     rule: StoppingRule,
     parameters: NewtonParameters = NewtonParameters(),
     *,
     max_it: int = 10_000,
-    start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
     """Minimise q(λ) = ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω. Collective.
@@ -524,7 +526,7 @@ def newton(
     Iterates are feasible, and q falls in each step. A step solves on a face of Ω by PCPG, drops
     what leaves Ω, all at once, and solves again on the smaller face. The numbers of the steps are
     those of docs/theory.md; docs/developers/implementation.md has a diagram. It begins at λ̄, which
-    is feasible, with the μ of ``start``.
+    is feasible, with the earlier μ.
 
     ===========================  =================================================================
     reason                       when
@@ -537,33 +539,31 @@ def newton(
     ===========================  =================================================================
 
     >>> import numpy as np
-    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.testing import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise, operator_product
+    >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
-    >>> start = homogenise(qp, operator_product(F, qp.coarse.comm, first_point(qp)))
-    >>> result = newton(qp, start, StoppingRule(1e-10))
+    >>> result = newton(qp, homogenise(qp, first_point(qp)), StoppingRule(1e-10))
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
     """
     steps = Steps()
     solver = FaceSolver(qp, rule, parameters, steps, max_it, monitor)
     # Step 0: a feasible start
-    z = Point(homogenised.lam_bar, homogenised.gradient)
-    mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
+    z, mu = start.at, np.zeros(qp.coarse.dimension) if start.lam is None else start.mu
     if mu is None:
         mu = multipliers_at(qp, z, unfelt=parameters.unfelt)
     state = NewtonIteration(qp, solver, parameters, z, mu)
-    monitor(steps, "start", homogenised.lam_bar, norm_over(qp.coarse.comm, homogenised.b), 0.0)
+    monitor(steps, "start", z.lam, norm_over(qp.coarse.comm, start.b), 0.0)
     friction = any_rank(qp.coarse.comm, state.pressed.status >= RUBS)
     reason = ConvergedReason.ITERATING
-    if friction and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
+    if friction and imbalance(qp.coarse, z.lam) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before
         reason = ConvergedReason.DIVERGED_STALLED
         state.look()
     # without friction and an earlier λ the first solve is on the face of the start, as it shows ‖F‖
-    looks = start is not None or friction
+    looks = start.lam is not None or friction
     while reason == ConvergedReason.ITERATING:
         first, face = state.z, state.pressed
         if looks:
@@ -578,7 +578,7 @@ def newton(
             # Step 2: the face
             first, face = state.wanted_face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        end, feasible = solver.solve(first, face, state.residual, state.resume)
+        end, feasible = solver.solve(first, face, state.residual, state.resume, state.cautious)
         # Step 4: accept where q falls enough
         if solver.excluding is not None:
             reason = ConvergedReason.DIVERGED_CONTRADICTION
@@ -592,8 +592,8 @@ def newton(
         face=state.pressed,
         reason=reason,
         projected_gradient=state.residual,
-        equality=qp.coarse.norm_Q(state.z.lam - homogenised.lam_bar),
-        reference=homogenised.reference,
+        equality=qp.coarse.norm_Q(state.z.lam - start.at.lam),
+        reference=start.reference,
         norm=solver.directions.norm,
         steps=steps,
         excluding=np.empty(0, np.int64) if solver.excluding is None else solver.excluding,

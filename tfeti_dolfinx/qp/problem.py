@@ -34,7 +34,7 @@ class FaceOperator(Protocol):
         """Free what it holds. Collective."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Point:
     """Multipliers and their gradient."""
 
@@ -51,21 +51,14 @@ class QP:
     coarse: Coarse  # projectors of G, and a particular solution of Gλ = e
     feasible: FeasibleSet  # the set Ω
     preconditioner: Operator | None = None  # approximate inverse of F, or None
-    norm: float = 1.0  # estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks
+    # estimate of ‖PFP‖ for solvers whose step lengths are relative to it; for others the largest
+    # Rayleigh quotient of F that earlier solves have seen; 0 if there were none
+    norm: float = 0.0
     # gives an approximate inverse of ZᵀFZ for a face Z, between vectors of the face in the layout
     # of all rows, until it is asked for another; or None
     preconditioner_on: Callable[[Face], Operator] | None = None
-    # largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none
-    seen: float = 0.0
     # directions of earlier solves, which those of PCPG are made F-orthogonal to
     recycled: Recycled | None = None
-    # flags of the local rows that are 0 on the face of `coarse`; None: of no face
-    held: Array | None = None
-    # whether a direction of PCPG is made conjugate to all before it, not the last alone
-    keeps: bool = True
-    # whether rows leave a face one by one after a step in which all together have raised q, or
-    # two in which what was left did not balance the load
-    cautious: bool = True
     # forces of a rank's rows if each were a spring that its gap presses, as stiff as bodies are
     # where so many rows carry together; None: unknown
     foundation: Callable[[int], Array] | None = None
@@ -151,14 +144,6 @@ class QPResult:
     excluding: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
-@dataclass(frozen=True)
-class Start:
-    """Initial guess of a solver."""
-
-    lam: Array  # multipliers λ
-    mu: Array | None  # multipliers of Gλ = e; None: those of another K⁺, which say nothing
-
-
 # --- Homogenisation: λ = x + λ̄ with Gλ̄ = e, so that Gx = 0 --------------------------------------
 
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
@@ -168,50 +153,21 @@ ROUNDING, STRANGE = 1e-14, 1e8
 FAR_OPEN = 1e-6
 
 
+def product(F: Operator, comm: MPI.Intracomm, x: Array) -> Array:
+    """F x; multiplies once if x ≠ 0. Collective."""
+    return F(x) if any_rank(comm, x) else np.zeros(len(x))
+
+
 @dataclass(frozen=True)
-class OperatorProduct:
-    """Vector x with the product Fx, this rank's parts."""
+class KnownProduct:
+    """A vector x with the product Fx, this rank's parts; empty: none is known."""
 
-    x: Array
-    Fx: Array
+    x: Array = field(default_factory=lambda: np.zeros(0))
+    Fx: Array = field(default_factory=lambda: np.zeros(0))
+    within: float = 0.0  # Fx stands for that of all vectors that are as near to x
 
-
-def operator_product(F: Operator, comm: MPI.Intracomm, x: Array) -> OperatorProduct:
-    """x and F x; multiplies once if x ≠ 0. Collective."""
-    return OperatorProduct(x, F(x) if any_rank(comm, x) else np.zeros(len(x)))
-
-
-class LastProduct:
-    """Last solution x of a program, with the product Fx.
-
-    Attributes:
-        x: The solution, or another solver's.
-        Fx: F x, which stands for that of all vectors within the distance ``within``, too.
-        within: That distance.
-        d: Linear term of the program that it was kept from, and e its right side.
-        looked: A point of the program with Fx − d, as an assessment computes it.
-    """
-
-    def __init__(self) -> None:
-        nothing: Array = np.zeros(0)
-        self.x, self.Fx, self.d, self.e = nothing, nothing, nothing, nothing
-        self.looked, self.within = (nothing, nothing), 0.0
-
-    def keep(self, result: QPResult, qp: QP) -> None:
-        """Store a solution with its gradient Fx − d − Gᵀμ, or that of an assessment. Collective.
-
-        So what steps leave out of the gradient does not grow from solve to solve.
-        """
-        (x, g), self.x, self.within = self.looked, result.lam, 0.0
-        other = any_rank(qp.coarse.comm, not np.array_equal(x, self.x))
-        self.Fx = (result.gradient + qp.coarse.combined(result.mu) if other else g) + qp.d
-        self.d, self.e = qp.d, np.array(qp.coarse.e)
-
-    def known(self, comm: MPI.Intracomm, x: Array) -> Array:
-        """Return this rank's Fx, or an empty array if x is no multiple of the last solution.
-
-        Collective.
-        """
+    def multiple(self, comm: MPI.Intracomm, x: Array) -> Array:
+        """Return F of a multiple of this vector, or an empty array if x is none. Collective."""
         if any_rank(comm, self.x.shape != x.shape):
             return np.zeros(0)
         square, along = dot_over(comm, (self.x, self.x), (self.x, x))
@@ -219,57 +175,55 @@ class LastProduct:
         found = norm_over(comm, x - c * self.x) <= ROUNDING * norm_over(comm, x)
         return c * self.Fx if found else np.zeros(0)
 
-    def take(self, comm: MPI.Intracomm, x: Array, Fx: Array) -> None:
-        """Restore what ``known`` has returned in another run. Collective."""
-        if any_rank(comm, Fx.size > 0):
-            self.x, self.Fx = x, Fx
-
-    def image(self, F: Operator, comm: MPI.Intracomm, x: Array) -> OperatorProduct:
-        """Return x with Fx; multiply by F only if x is not the last solution. Collective."""
-        known = self.known(comm, x)
+    def image(self, F: Operator, comm: MPI.Intracomm, x: Array) -> Array:
+        """Return Fx of any x; multiply only where it is not known. Collective."""
+        known = self.multiple(comm, x)
         if self.within > 0.0 and not any_rank(comm, x.shape != self.x.shape):
             known = self.Fx if norm_over(comm, x - self.x) <= self.within else known
-        found = any_rank(comm, known.size > 0)
-        return OperatorProduct(x, known) if found else operator_product(F, comm, x)
+        return known if any_rank(comm, known.size > 0) else product(F, comm, x)
 
 
 @dataclass(frozen=True)
-class Homogenised:
-    """min ½xᵀPFPx − bᵀx subject to Gx = 0, x + λ̄ ∈ Ω."""
+class Start:
+    """Start of a solver: min ½xᵀPFPx − bᵀx subject to Gx = 0, x + λ̄ ∈ Ω, and an earlier λ."""
 
-    lam_bar: Array  # λ̄
-    gradient: Array  # F λ̄ − d
+    at: Point  # λ̄
     b: Array  # P(d − F λ̄)
     reference: float  # size of residuals, b₀
     rounding: float  # what rounding leaves of b₀ where it should be 0
+    lam: Array | None = None  # multipliers of an earlier solve, if there was one
+    mu: Array | None = None  # those of Gλ = e, if they are of this K⁺: others say nothing
 
 
-def homogenise(qp: QP, at: OperatorProduct | None = None, warm: bool = False) -> Homogenised:
+def homogenise(
+    qp: QP, lam: Array | None = None, Fx: Array | None = None, warm: bool = False
+) -> Start:
     """Homogenise a quadratic program. Collective.
 
     Args:
         qp: The program.
-        at: A solution of Gλ̄ = e with its image; default λ̄₀, which costs one multiplication by F if
-            e ≠ 0.
+        lam: λ̄, a solution of Gλ̄ = e; default λ̄₀.
+        Fx: F λ̄; by default it costs a multiplication if λ̄ ≠ 0.
         warm: Whether λ̄ may be the solution. ‖P d‖ and ‖P F λ‖ are equal there, and b₀ is ‖P d‖
             where e = 0: the larger one is taken.
     """
     project, norm = qp.coarse.project, partial(norm_over, qp.coarse.comm)
-    at = at or operator_product(qp.F, qp.coarse.comm, qp.coarse.particular())
+    lam = qp.coarse.particular() if lam is None else lam
+    Fx = product(qp.F, qp.coarse.comm, lam) if Fx is None else Fx
     # 1. b; d on rows that are open without forces: P would spread it over all others
-    gradient = at.Fx - qp.d
+    gradient = Fx - qp.d
     residual = project(gradient)
     face = face_at(qp.feasible, qp.feasible.project(np.zeros(len(qp.d))), -qp.d)
     gaps = np.where(face.free | (face.beta != 0.0), 0.0, qp.d)
     b = project(-gradient - gaps)
     b = b + gaps if norm(b) <= FAR_OPEN * norm(gaps) else -residual
     # 2. the size of residuals, and its rounding, to which open gaps, however wide, do not count
-    size = max(norm(project(qp.d)), norm(project(at.Fx))) if warm else norm(residual)
-    face = face_at(qp.feasible, qp.feasible.project(at.x), residual)
+    size = max(norm(project(qp.d)), norm(project(Fx))) if warm else norm(residual)
+    face = face_at(qp.feasible, qp.feasible.project(lam), residual)
     # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
     counts = face.free | ((face.beta != 0.0) & (qp.d > 0.0))
-    rounding = ROUNDING * sum(norm(np.where(counts, x, 0.0)) for x in (qp.d, at.Fx))
-    return Homogenised(at.x, gradient, b, size, rounding)
+    rounding = ROUNDING * sum(norm(np.where(counts, x, 0.0)) for x in (qp.d, Fx))
+    return Start(Point(lam, gradient), b, size, rounding)
 
 
 # --- Stopping rules ---------------------------------------------------------------------------
@@ -295,8 +249,8 @@ class StoppingRule:
         """Examine an iterate whose residuals are small. Collective.
 
         ``gradient`` is Fλ − d up to the range of Gᵀ, ``residual`` max(‖g^P‖, ‖F‖‖Qx‖), ``norm``
-        ‖F‖, or an estimate: residuals over it are errors of multipliers. Return why to stop, or
-        ITERATING; then ``tolerance`` is below ``residual``.
+        ‖F‖, or an estimate, or 0: residuals over it are errors of multipliers. Return why to stop,
+        or ITERATING; then ``tolerance`` is below ``residual``.
         """
         small = residual <= self.tolerance
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING

@@ -67,7 +67,7 @@ def project_onto_feasible(
     λ, and α, which all ranks have.
 
     >>> import numpy as np
-    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.testing import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> coarse = DenseCoarse(np.ones((1, 2)), np.ones(1))
     >>> project_onto_feasible(coarse, Bounds(), np.array([1.0, -1.0]))[0].tolist()

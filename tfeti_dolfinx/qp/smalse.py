@@ -12,14 +12,13 @@ from tfeti_dolfinx.qp.problem import (
     QP,
     STRANGE,
     ConvergedReason,
-    Homogenised,
     Monitor,
     QPResult,
     Start,
     Steps,
     StoppingRule,
     no_monitor,
-    operator_product,
+    product,
 )
 
 
@@ -74,17 +73,16 @@ class InnerTest:
     """
 
     def __init__(
-        self, qp: QP, homogenised: Homogenised, rule: StoppingRule, parameters: SmalseParameters
+        self, qp: QP, start: Start, rule: StoppingRule, parameters: SmalseParameters
     ) -> None:
-        self._qp, self._homogenised, self._rule = qp, homogenised, rule
-        self._parameters = parameters
-        self._eta = parameters.eta * norm_over(qp.coarse.comm, homogenised.b)
+        self._qp, self._start, self._rule, self._parameters = qp, start, rule, parameters
+        self._eta = parameters.eta * norm_over(qp.coarse.comm, start.b)
         self.M, self.reason, self.idle = parameters.M * qp.norm, ConvergedReason.ITERATING, 0
         self._lagrangian, self._equality = -float("inf"), float("inf")
 
     def __call__(self, state: MprgpIterate) -> bool:
         """Return whether the inner loop may end. Collective."""
-        equality = self._qp.coarse.norm_Q(state.x - self._homogenised.lam_bar)
+        equality = self._qp.coarse.norm_Q(state.x - self._start.at.lam)
         gradient = state.projected_gradient
         if max(gradient, self._qp.norm * equality) <= self._rule.tolerance:
             self.examine(state, equality)
@@ -115,12 +113,11 @@ class InnerTest:
 
 def smalse(
     qp: QP,
-    homogenised: Homogenised,
+    start: Start,
     rule: StoppingRule,
     parameters: SmalseParameters = SmalseParameters(),
     *,
     max_it: int = 10_000,
-    start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
     """Solve min ½xᵀFx − bᵀx, Gx = 0, where x = λ − λ̄ and λ ∈ Ω, for λ. Collective.
@@ -128,7 +125,7 @@ def smalse(
     Dostál, Optimal Quadratic Programming Algorithms, Springer 2009, chapter 6 (SMALBE-M);
     Dostál, Kozubek, Math. Program. 135 (2012) 195–220. Step numbers are those of the talk.
     B is an orthonormalised G, so that ‖Bx‖ = ‖Qx‖; Bᵀμ = y is kept instead of μ. Preconditioners
-    are not used. Without a start it begins at P_Ω(λ̄) with μ = 0.
+    are not used. It begins at P_Ω(λ) of an earlier λ, with its μ, else at P_Ω(λ̄) with μ = 0.
 
     ===========================  =================================================================
     reason                       when
@@ -141,7 +138,7 @@ def smalse(
     ===========================  =================================================================
 
     >>> import numpy as np
-    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.testing import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
@@ -150,21 +147,20 @@ def smalse(
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
     """
-    b, coarse, norm, rho = homogenised.b, qp.coarse, qp.norm, parameters.rho * qp.norm
+    b, coarse, norm, rho = start.b, qp.coarse, qp.norm, parameters.rho * qp.norm
 
     def A(x: Array) -> Array:  # (P F P + ρ Q)x
         Qx = coarse.Q(x)
         FPx = qp.F(x - Qx)
         return FPx - coarse.Q(FPx) + rho * Qx
 
-    test, steps = InnerTest(qp, homogenised, rule, parameters), Steps()
+    test, steps = InnerTest(qp, start, rule, parameters), Steps()
     # λ = P_Ω(λ̄), or that of a start; x = λ − λ̄; g = Ax − b + y
-    lam_bar, y = homogenised.lam_bar, np.zeros_like(b)
-    if start is not None and start.mu is not None:
-        y = coarse.combined(start.mu)
-    lam = qp.feasible.project(lam_bar if start is None else start.lam)
+    lam_bar = start.at.lam
+    y = np.zeros_like(b) if start.mu is None else coarse.combined(start.mu)
+    lam = qp.feasible.project(lam_bar if start.lam is None else start.lam)
     x = lam - lam_bar
-    g = operator_product(A, qp.coarse.comm, x).Fx - b + y
+    g = product(A, qp.coarse.comm, x) - b + y
     state = MprgpIterate(A, lam, g, qp.feasible, qp.coarse.comm)
     inner = MprgpParameters(parameters.alpha_bar / (max(norm, rho) or 1.0), parameters.gamma)
     reason = ConvergedReason.ITERATING
@@ -177,7 +173,7 @@ def smalse(
         equality = norm_over(qp.coarse.comm, Qx)
         monitor(steps, "outer", state.x, state.projected_gradient, equality)
         indefinite = broken == ConvergedReason.DIVERGED_INDEFINITE_MAT  # or rounding
-        if indefinite and test.examine(state, equality) <= STRANGE * homogenised.rounding:
+        if indefinite and test.examine(state, equality) <= STRANGE * start.rounding:
             broken = ConvergedReason.DIVERGED_ROUNDING
         reason = test.reason or broken or ConvergedReason.ITERATING
         if reason != ConvergedReason.ITERATING:
@@ -204,7 +200,7 @@ def smalse(
         reason=reason,
         projected_gradient=state.projected_gradient,
         equality=equality,
-        reference=homogenised.reference,
+        reference=start.reference,
         norm=norm,
         steps=steps,
     )

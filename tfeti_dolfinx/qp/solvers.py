@@ -2,48 +2,42 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.qp.krylov import PcpgParameters, solve_by_pcpg
-from tfeti_dolfinx.qp.newton import NewtonParameters, feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import QP, QPResult, Start
-from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
+from tfeti_dolfinx.qp.krylov import solve_by_pcpg
+from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
+from tfeti_dolfinx.qp.problem import QP, QPResult
+from tfeti_dolfinx.qp.smalse import smalse
 
 
 @dataclass(frozen=True)
 class Solver:
     """QP solver, with its requirements."""
 
-    # solves a program from its homogenised form, with a stopping rule and `parameters`; by name
-    # `max_it`, `start` and `monitor`, as `newton` does
+    # solves a program from a start, with a stopping rule and parameters, those of options with its
+    # name; by name `max_it` and `monitor`, as `newton` does
     solve: Callable[..., QPResult]
-    parameters: Any  # its parameters, where options have none of the solver's name
     keeps_sets: bool  # whether it keeps inequalities and friction
     pc_type: str  # preconditioner that `auto` stands for
     relative_to_norm: bool  # whether its steps are relative to ‖PFP‖
     # where it starts, which is its λ̄; None: λ̄₀ = Gᵀ(GGᵀ)⁻¹e
     cold: Callable[[QP], Array] | None = None
-    # from a start to its λ̄; None: λ̄ is as without one
-    warm: Callable[[QP, Start], Array] | None = None
+    # from an earlier λ to λ̄; None: λ̄ is as without one
+    warm: Callable[[QP, Array], Array] | None = None
 
 
 SOLVERS = {
     "pcpg": Solver(
         solve_by_pcpg,
-        PcpgParameters(),
         keeps_sets=False,
         pc_type="auto",
         relative_to_norm=False,
         # the nearest solution of Gλ̄ = e: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ)
-        warm=lambda qp, start: qp.coarse.project(start.lam) + qp.coarse.particular(),
+        warm=lambda qp, lam: qp.coarse.project(lam) + qp.coarse.particular(),
     ),
-    "smalse": Solver(
-        smalse, SmalseParameters(), keeps_sets=True, pc_type="none", relative_to_norm=True
-    ),
+    "smalse": Solver(smalse, keeps_sets=True, pc_type="none", relative_to_norm=True),
     "newton": Solver(
         newton,
-        NewtonParameters(),
         keeps_sets=True,
         pc_type="auto",
         relative_to_norm=False,

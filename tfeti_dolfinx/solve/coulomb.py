@@ -20,7 +20,7 @@ from tfeti_dolfinx.qp.friction_newton import (
     newton_on_law,
 )
 from tfeti_dolfinx.qp.newton import growth, multipliers_at, seen_norm
-from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, Point, QPResult, Steps
+from tfeti_dolfinx.qp.problem import ConvergedReason, KnownProduct, Monitor, Point, QPResult, Steps
 from tfeti_dolfinx.solve.solver import solve_dual
 
 
@@ -177,9 +177,11 @@ def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, 
             motion = coarse.bodies.part_of(state.u)
     if motion is None:
         return ""
+    slips = np.zeros(len(dual.d))
+    slips[coarse.rubbing] = np.abs(coarse.J @ motion)[coarse.rubbing]
     result.reason = ConvergedReason.DIVERGED_FRICTION
-    words, result.excluding = dual.sliding(motion)
-    return words
+    result.excluding = np.flatnonzero(slips > 0.5 * largest(coarse.comm, slips))
+    return coarse.bodies.sentence(coarse.bodies.amounts(motion))
 
 
 class FrictionBounds:
@@ -361,7 +363,7 @@ class NewtonOnLaw:
         self.steps, self._share = 0, 1.0
         self._recycled = dual.recycled
         self._before: Array = np.zeros(0)  # bounds before those of the last answer
-        pairs = (dual.last.d, dual.d), (dual.last.e, dual.coarse.e)
+        pairs = zip(dual.solved, (dual.d, dual.coarse.e), strict=True)
         other = not all(np.array_equal(kept, now) for kept, now in pairs)
         self._rests = not any_rank(dual.coarse.comm, other)
 
@@ -401,7 +403,7 @@ class NewtonOnLaw:
         qp, normals, tangents = dual.qp(), rows.pressed_by[at], rows.sets.tangents[at]
         law = Law(lambda known: dual.law(rows.with_pressures(known)), normals, tangents)
         # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
-        Fx = dual.last.image(qp.F, qp.coarse.comm, start[0]).Fx
+        Fx = dual.last.image(qp.F, qp.coarse.comm, start[0])
         dual.seen = dual.seen or seen_norm(qp, Point(start[0], Fx - qp.d))
         if (norm := dual.seen) == 0.0:
             return None
@@ -430,8 +432,7 @@ class NewtonOnLaw:
             return None
         # F of the end stands for that of the nearest point of its set, where the problem begins
         Fx = end.s + qp.coarse.combined(end.mu) + qp.d
-        dual.last.x, dual.last.Fx = end.lam, Fx
-        dual.last.within = parameters.newton.unseen * target / norm
+        dual.last = KnownProduct(end.lam, Fx, within=parameters.newton.unseen * target / norm)
         # the bounds of multipliers for which the law holds; what cannot be seen bounds none
         self._before, bounds.now = bounds.now, bounds.forces_of(end.lam, dual.last.within)
         dual.bound_friction(bounds.now)

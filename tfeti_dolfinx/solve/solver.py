@@ -17,15 +17,13 @@ from tfeti_dolfinx.qp.coarse import imbalance
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
-    Homogenised,
+    KnownProduct,
     Monitor,
-    OperatorProduct,
     PrintMonitor,
     QPResult,
     Start,
     homogenise,
     no_monitor,
-    operator_product,
 )
 from tfeti_dolfinx.qp.projection import UNBALANCED
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
@@ -79,7 +77,16 @@ def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
     friction = options.friction_type
     if friction == "auto":
         friction = "newton" if qp_type == "newton" else "fixed_point"
-    return replace(options, qp_type=qp_type, pc_type=pc_type, friction_type=friction)
+    keeps, cautious = (name not in options.without for name in ("kept_directions", "cautious"))
+    pcpg = replace(options.pcpg, keeps=keeps)
+    return replace(
+        options,
+        qp_type=qp_type,
+        pc_type=pc_type,
+        friction_type=friction,
+        pcpg=pcpg,
+        newton=replace(options.newton, pcpg=pcpg, cautious=cautious),
+    )
 
 
 def solve_dual(
@@ -106,14 +113,10 @@ def solve_dual(
     cite("tfeti", qp_type)
     solver = SOLVERS[qp_type]
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
-    begin = None
-    if start is not None and any_rank(qp.coarse.comm, start[0]):
-        lam, mu = start  # of another kernel μ says nothing
-        begin = Start(lam, np.array(mu) if len(mu) == qp.coarse.dimension else None)
-    homogenised = _homogenise(dual, qp, solver, begin)
+    begin = _begin(dual, qp, solver, start)
     # of a set of one's own solvability knows which rows pull, not how much they bear
     given = dual.law is not contact_set and solver.cold is not None
-    if given and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
+    if given and imbalance(qp.coarse, begin.at.lam) > UNBALANCED:
         raise NoSolutionError(
             "extensions: feasible_set has no forces that balance the load; expected a set that "
             "bears it, or a Dirichlet condition or a spring besides"
@@ -121,12 +124,9 @@ def solve_dual(
     if monitor is None and options.monitor:
         monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
     rtol = options.number if rtol is None else rtol
-    scale = homogenised.reference, homogenised.rounding
-    rule = make_rule(dual, rtol, options.atol, scale, goal)
-    own, most = getattr(options, qp_type, solver.parameters), options.max_it
-    result = solver.solve(
-        qp, homogenised, rule, own, max_it=most, start=begin, monitor=monitor or no_monitor
-    )
+    rule = make_rule(dual, rtol, options.atol, (begin.reference, begin.rounding), goal)
+    own, most = getattr(options, qp_type), options.max_it
+    result = solver.solve(qp, begin, rule, own, max_it=most, monitor=monitor or no_monitor)
     rounding = result.reason == ConvergedReason.DIVERGED_ROUNDING
     if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
         late.steps = 0  # K_bb of thin parts spans more digits than S: begin again
@@ -136,31 +136,39 @@ def solve_dual(
         dual.rough = None  # what single precision does not tell: begin again with F itself
         return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
-    if rule.looks:
-        dual.last.looked = rule.recovered.lam, rule.recovered.residual
     if dual.coarse.dimension == 0 or qp_type == "newton":
-        dual.last.keep(result, qp)
+        # what steps leave out of the gradient does not grow from solve to solve, where a look was
+        # at the end
+        end = rule.recovered if rule.looks else None
+        if end is None or any_rank(qp.coarse.comm, not np.array_equal(end.lam, result.lam)):
+            Fx = result.gradient + qp.coarse.combined(result.mu) + qp.d
+        else:
+            Fx = end.residual + qp.d
+        dual.last, dual.solved = KnownProduct(result.lam, Fx), (qp.d, np.array(qp.coarse.e))
     if result.reason <= 0 and (options.max_it > 0 or rule.looks == 0):  # else a look was all
         rule.examine_stopped(result)
     return result, rule
 
 
-def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:
-    """Homogenise with λ̄ at the solver's start, or λ̄₀."""
-    if start is not None and solver.warm is not None:
-        at = dual.last.image(qp.F, qp.coarse.comm, solver.warm(qp, start))
-        # Begin at 0 where it is admissible and q is no less at a start, as after unloading: of what
-        # the start has and the solution has not, conjugate gradients would leave its rounding.
-        zero = np.zeros(len(qp.d))
-        may = not np.any(qp.coarse.e) and not np.any(qp.feasible.project(zero))
-        energy, work = qp.dot((at.x, at.Fx), (at.x, qp.d))
-        if not any_rank(qp.coarse.comm, not may) and 0.5 * energy >= work:
-            at = OperatorProduct(zero, zero)
-            if start.mu is not None:
-                start.mu[:] = 0.0
-        return homogenise(qp, at, warm=True)
-    cold = qp.coarse.particular() if solver.cold is None else solver.cold(qp)
-    return homogenise(qp, operator_product(qp.F, qp.coarse.comm, cold))
+def _begin(dual: Dual, qp: QP, solver: Solver, earlier: tuple[Array, Array] | None) -> Start:
+    """Return where a solver begins: as it does with earlier multipliers, if they are not 0."""
+    comm, lam, mu = qp.coarse.comm, None, None
+    if earlier is not None and any_rank(comm, earlier[0]):
+        lam, mu = earlier
+        mu = mu if len(mu) == qp.coarse.dimension else None
+    if lam is None or solver.warm is None:
+        cold = None if solver.cold is None else solver.cold(qp)
+        return replace(homogenise(qp, cold), lam=lam, mu=mu)
+    at = solver.warm(qp, lam)
+    Fx = dual.last.image(qp.F, comm, at)
+    # Begin at 0 where it is admissible and q is no less at a start, as after unloading: of what
+    # the start has and the solution has not, conjugate gradients would leave its rounding.
+    zero = np.zeros(len(qp.d))
+    may = not np.any(qp.coarse.e) and not np.any(qp.feasible.project(zero))
+    energy, work = qp.dot((at, Fx), (at, qp.d))
+    if not any_rank(comm, not may) and 0.5 * energy >= work:
+        at, Fx, mu = zero, zero, None if mu is None else np.zeros(len(mu))
+    return replace(homogenise(qp, at, Fx, warm=True), lam=lam, mu=mu)
 
 
 def conclude(

@@ -127,7 +127,7 @@ class Predictor:
         if self.rows_and_start is None or self._dual is None:
             return np.zeros(0), np.zeros(0)
         lam = self.rows_and_start[1]
-        return lam, self._dual.last.known(self._dofs.comm, lam)
+        return lam, self._dual.last.multiple(self._dofs.comm, lam)
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
         """Return the nearest displacement to w.
@@ -175,11 +175,11 @@ class Predictor:
         """Return the displacement in primal order."""
         dual, options, start = self._dual, self._options, None
         assert dual is not None
-        dual.forget_counts()
+        dual.begin_solve()
         if self.rows_and_start is not None:  # nothing has a kernel in M
             start = (gluing.multipliers(*self.rows_and_start), np.zeros(0))
             if self.rows_and_start[0] is gluing:
-                dual.last.take(self._dofs.comm, self.rows_and_start[1], self.image)
+                dual.know(self.rows_and_start[1], self.image)
         self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
         result, accuracy = solve_dual(dual, options, options.qp_type, start)
         self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None

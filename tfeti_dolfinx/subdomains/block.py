@@ -189,6 +189,10 @@ class Springs:
         KW = multiply(W)
         return cls(W, KW @ np.linalg.inv(W.T @ KW), D)  # PᵀW = I, however small D is beside K
 
+    def stretched(self, x: Array) -> Array:
+        """√D Pᵀx, shapes ``(n,)`` or ``(n, q)``."""
+        return np.asarray((np.sqrt(self.stiffness) * (self.stretches.T @ x).T).T)
+
     def without(self, solve: Callable[[Array], Array], b: Array) -> Array:
         """Return K₁⁺ b, from K⁺, shapes ``(n,)`` or ``(n, q)``."""
         x = solve(b - self.stretches @ (self.directions.T @ b))

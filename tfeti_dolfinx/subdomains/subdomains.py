@@ -141,9 +141,7 @@ class Subdomains:
     def spring_rows(self) -> csr_array:
         """√D PᵀR of the springs, shape ``(k, r)``."""
         parts = [
-            np.zeros((0, block.kernel.shape[1]))
-            if (own := block.springs) is None
-            else np.sqrt(own.stiffness)[:, None] * (own.stretches.T @ block.kernel)
+            block.springs.stretched(block.kernel) if block.springs else block.kernel[:0]
             for block in self.blocks
         ]
         return self._on_kernels(parts)
