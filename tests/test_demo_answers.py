@@ -60,7 +60,7 @@ QUICK = {
         "two", pressure=0.01, duration=0.01, oscillates=0.01, velocity=0.03, energy=0.02
     ),
     # the die piles the slab up before it
-    "ironing_3d": {"balance": 1e-3, "force_along_over_force_down": (0.3, 0.4)},
+    "ironing_3d": {"balance": 1e-9, "force_along_over_force_down": (0.3, 0.4)},
     "mindlin_3d": partial_slip(0.15, 0.25),
     "sphere_on_block_3d": hertz(1e-4, 0.05),
     "stacked_blocks_3d": {"force_base": 1e-5},

@@ -70,9 +70,10 @@ class Held:
         return self.d.comm.allreduce(int(np.sum(flags)))
 
 
-def test_a_prescribed_tangent_leaves_a_row_without_entries():
-    """On the left side x is held: the disc becomes an interval, and its other row stays."""
-    held = Held(TRESCA, left=(0, 0.125))
+@pytest.mark.parametrize("value", [0.0, 0.125])
+def test_a_prescribed_tangent_leaves_a_row_without_entries(value):
+    """On the left side x is held: the disc becomes an interval, or is whole where x is drawn."""
+    held = Held(TRESCA, left=(0, value))
     rows, sets = held.gluing.tangents, held.gluing.constraints.sets
     on_left = group_points(held.dofs)[held.records.group[rows.condition], 0] < 1e-9
     assert held.count(on_left) == 3
@@ -80,10 +81,11 @@ def test_a_prescribed_tangent_leaves_a_row_without_entries():
     along_x = np.abs(held.records.tangents[rows.condition, :, 0]) > 0.5
     assert np.array_equal(~rows.moves, along_x & on_left[:, None])
     bound, _ = rows.bounds(np.full((len(held.records), 2), 0.5), held.records.area)
-    assert np.all((bound > 0.0) == rows.moves)
+    assert np.all((bound > 0.0) == (rows.moves | (value > 0.0)))
     expected = 0.5 * held.records.area[rows.condition] / rows.scale
     assert np.allclose(bound.max(axis=1, initial=0.0), expected)
-    assert np.all(held.gluing.constraints.c[sets.tangents] == 0.0)
+    slip = np.abs(held.gluing.constraints.c[sets.tangents]) / rows.scale[:, None]
+    assert np.allclose(slip, np.where(rows.moves, 0.0, value))
 
 
 @pytest.mark.parametrize(("cell", "counts"), [("hexahedron", (4, 3)), ("tetrahedron", (5, 4))])
@@ -132,7 +134,7 @@ def test_prescribed_values_slip():
     assert np.allclose(found, whole[rows.condition], rtol=0, atol=1e-12)
     # a load step that begins elsewhere
     begin = np.cos(1.0 + whole)
-    later = gluing.with_right_side(gluing.prescribed.value, records.gap, begin)
+    later = gluing.with_right_side(gluing.prescribed.value, records.gap, (begin, begin))
     found = times_rows(later, u)[gluing.constraints.sets.tangents] / rows.scale[:, None]
     assert np.allclose(found, (whole - begin)[rows.condition], rtol=0, atol=1e-12)
 

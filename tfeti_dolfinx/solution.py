@@ -530,8 +530,9 @@ class Solution:
 
         Shape ``(n, gdim)``. Collective at first use.
         """
-        records = self.gluing.records
-        return np.einsum("nt,ntg->ng", self._motion[1] - self.gluing.slip, records.tangents)
+        forced = self.forced_slip
+        slip = np.where(np.isnan(forced), self._motion[1] - self.gluing.slip, forced)
+        return np.einsum("nt,ntg->ng", slip, self.gluing.records.tangents)
 
     @cached_property
     def slip_at_end(self) -> Array:

@@ -331,7 +331,7 @@ class System(Generic[OwnForms]):
         if self._has_friction:
             self.change("right side")
         elif self._gluing is not None:
-            self._gluing = replace(self._gluing, slip=self._slip())
+            self._gluing = replace(self._gluing, slip=self._slip()[0])
 
     def begun(self) -> Array:
         """Return where the load step began, with free motions of rigid bodies, shape ``(n,)``."""
@@ -528,23 +528,29 @@ class System(Generic[OwnForms]):
         self.dual.seen = max(self.dual.seen, self._seen)
         self._equals.kept.clear()
 
-    def _slip(self) -> Array:
-        """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""
+    def _slip(self) -> tuple[Array, Array]:
+        """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``.
+
+        And those of prescribed components alone.
+        """
         records = self.search.records
         if self._rest is None:
-            return np.zeros(records.tangents.shape[:2])
+            return (np.zeros(records.tangents.shape[:2]),) * 2
         if self._known_slips is not None:
             before, slip = self._known_slips
             names = ("frame", "condition", "entry_group", "weight")
             same = all(np.array_equal(getattr(records, n), getattr(before, n)) for n in names)
             if not any_rank(self._dofs.comm, not same):
                 if not self.tools:
-                    return slip
+                    return slip, slip
                 # of the points of rigid bodies that are there now
                 way = before.motion - self.tools.motion_at_begin(records)
-                return slip + np.einsum("ntg,ng->nt", records.tangents, way)
+                return (slip + np.einsum("ntg,ng->nt", records.tangents, way),) * 2
         begun = replace(records, motion=self.tools.motion_at_begin(records))
-        return slips(begun, self._dofs, self._rest)
+        slip = slips(begun, self._dofs, self._rest)
+        if not self._has_friction:
+            return slip, slip
+        return slip, slips(begun, self._dofs, self._rest, made(self._prescribed).flag)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:

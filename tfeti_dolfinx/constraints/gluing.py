@@ -102,8 +102,8 @@ class Gluing:
     tangents: TangentRows  # origin of the tangential rows
     constraints: Constraints  # B, c and the sets of rows
     length: float  # a length of the scene
-    # where the load step begins: the tangential v_i of all conditions then, shape (n, gdim - 1).
-    # Friction acts on what comes to it
+    # where the load step begins: the tangential v_i of all conditions then, shape (n, gdim - 1), of
+    # prescribed components alone where a tangent is prescribed. Friction acts on what comes to it
     slip: Array
 
     def right_side(self) -> Array:
@@ -142,11 +142,15 @@ class Gluing:
         Collective.
         """
         along = np.einsum("ntg,ng->nt", self.records.tangents, self._held[0])
-        forced = np.zeros(along.shape, dtype=bool)
+        return np.where(self._forced(), along - self.slip, np.nan)
+
+    def _forced(self) -> Array:
+        """Return flags of tangents that are prescribed, of conditions with friction and a row."""
+        forced = np.zeros(self.slip.shape, dtype=bool)
         forced[self.contact.condition] = True
         forced[self.records.friction == Friction.NONE] = False
         forced[self.tangents.condition] &= ~self.tangents.moves
-        return np.where(forced, along - self.slip, np.nan)
+        return forced
 
     @cached_property
     def _held(self) -> tuple[Array, Array, Array]:
@@ -160,20 +164,25 @@ class Gluing:
         curved = 2.0 * np.abs(records.curved_gap - records.geometric_gap)
         return held, left, curved + TOLERANCES.overlap * self.length
 
-    def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
+    def with_right_side(
+        self, values: Array, gaps: Array, begin: tuple[Array, Array] | None = None
+    ) -> Gluing:
         """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.
 
         Values are of owned groups, shape ``(g, bs)``, and have no effect on components that are not
-        prescribed; gaps, lengths, of the conditions; slips as the attribute, default that. The
-        constraints are shared with these rows: their c is the new one too. What raises, as
-        ``right_side`` says, leaves it as it was.
+        prescribed; gaps, lengths, of the conditions; slips where the step begins are those of all
+        components, and of prescribed ones alone, default the attribute. The constraints are shared
+        with these rows: their c is the new one too. What raises, as ``right_side`` says, leaves it
+        as it was.
         """
-        flag = self.prescribed.flag
+        flag, slip = self.prescribed.flag, self.slip
+        if begin is not None:
+            slip = np.where(self._forced(), begin[1], begin[0])
         gluing = replace(
             self,
             prescribed=Prescribed(flag, np.where(flag, values, 0.0)),
             records=replace(self.records, gap=gaps),
-            slip=self.slip if slip is None else slip,
+            slip=slip,
         )
         gluing = replace(gluing, tangents=replace(self.tangents, drawn=gluing._drawn()))
         self.constraints.c[:] = gluing.right_side()
@@ -234,7 +243,7 @@ def glue(
     records: ContactRecords,
     length: float,
     weights: Array,
-    slip: Array | None = None,
+    slip: tuple[Array, Array] | None = None,
     tools: Tools | None = None,
 ) -> Gluing:
     """Rows of interfaces, Dirichlet conditions and contacts, and their right sides. Collective.
@@ -263,12 +272,12 @@ def glue(
         tangents.normal,
         tools.num_unknowns if tools else 0,
     )
-    slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
+    none = np.zeros(records.tangents.shape[:2])
     gluing = Gluing(
-        dofs, prescribed, records, to_equalities, contact, tangents, constraints, length, slip
+        dofs, prescribed, records, to_equalities, contact, tangents, constraints, length, none
     )
     try:
-        return gluing.with_right_side(prescribed.value, records.gap)
+        return gluing.with_right_side(prescribed.value, records.gap, slip)
     except TfetiError:  # on all ranks
         constraints.B.destroy()
         raise

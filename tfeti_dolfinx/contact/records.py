@@ -120,15 +120,23 @@ def relative_motion(records: ContactRecords, dofs: TornDofs, values: Array) -> A
     return sum_rows(records.condition, records.weight[:, None] * u, len(records))
 
 
-def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
-    """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective."""
+def relative_displacement(
+    records: ContactRecords, dofs: TornDofs, u: Array, flag: Array | bool = True
+) -> Array:
+    """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective.
+
+    Flags of components of the owned groups, shape ``(g, gdim)``, leave others out.
+    """
     total = dofs.reduce(u.reshape(-1, dofs.bs), np.add)
-    return relative_motion(records, dofs, total / dofs.multiplicity[:, None]) - records.motion
+    return (
+        relative_motion(records, dofs, flag * total / dofs.multiplicity[:, None]) - records.motion
+    )
 
 
-def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
+def slips(records: ContactRecords, dofs: TornDofs, u: Array, flag: Array | bool = True) -> Array:
     """Return the v_i along the tangents of the frames, shape ``(n, gdim - 1)``. Collective."""
-    return np.einsum("ntg,ng->nt", records.tangents, relative_displacement(records, dofs, u))
+    v = relative_displacement(records, dofs, u, flag)
+    return np.einsum("ntg,ng->nt", records.tangents, v)
 
 
 def held_pressures(
