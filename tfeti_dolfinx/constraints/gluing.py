@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, quotient
 from tfeti_dolfinx.common.parallel import any_rank, count_over, largest, least
 from tfeti_dolfinx.constraints.contact_rows import (
     ContactRows,
@@ -121,8 +121,8 @@ class Gluing:
                 f"prescribed: {overlaps} node{'s penetrate' if overlaps > 1 else ' penetrates'} by "
                 f"up to {-deepest:.6g} whatever the rest does"
             )
-        along = np.einsum("ntg,ng->nt", records.tangents, held)
-        slips = (self.slip - along)[tangents.condition]
+        along, at = np.einsum("ntg,ng->nt", records.tangents, held), tangents.condition
+        slips = np.where(tangents.moves, (self.slip - along)[at], -self._given_slip[at])
         c = np.zeros(self.constraints.num_rows)
         c[sets.equalities] = self.to_equalities @ self.prescribed.value.ravel()
         c[sets.normals] = left[normals.condition] * normals.scale
@@ -141,12 +141,29 @@ class Gluing:
         They are those of conditions with friction and a normal row; others are not numbers.
         Collective.
         """
-        along = np.einsum("ntg,ng->nt", self.records.tangents, self._held[0])
-        forced = np.zeros(along.shape, dtype=bool)
+        slip = self._given_slip
+        forced = np.zeros(slip.shape, dtype=bool)
         forced[self.contact.condition] = True
         forced[self.records.friction == Friction.NONE] = False
         forced[self.tangents.condition] &= ~self.tangents.moves
-        return np.where(forced, along - self.slip, np.nan)
+        return np.where(forced, slip, np.nan)
+
+    @cached_property
+    def _given_slip(self) -> Array:
+        """Slips of prescribed components, ``(n, gdim - 1)``. Collective at first use.
+
+        What is left of a tangent without a row moves with these: else parts of a body that is
+        carried along would slip over each other.
+        """
+        records, prescribed = self.records, self.prescribed
+        signless = replace(records, weight=np.abs(records.weight))
+        values, weights = (
+            relative_motion(signless, self.dofs, of)
+            for of in (prescribed.value, prescribed.flag.astype(float))
+        )
+        left = relative_motion(records, self.dofs, (~prescribed.flag).astype(float))
+        motion = self._held[0] + left * quotient(values, weights)
+        return np.einsum("ntg,ng->nt", records.tangents, motion) - self.slip
 
     @cached_property
     def _held(self) -> tuple[Array, Array, Array]:
@@ -187,9 +204,8 @@ class Gluing:
         values, motion = self.prescribed.value, self.records.motion
         known = np.concatenate([x.ravel() for x in (values, motion, self.slip)])
         least_slip = TOLERANCES.still * largest(self.dofs.comm, known)
-        along = np.einsum("ntg,ng->nt", self.records.tangents[at], self._held[0][at])
-        slips = np.abs(along - self.slip[at])
-        return ~moves & np.any(moves, axis=1)[:, None] & (slips > least_slip)
+        slips = np.abs(self._given_slip[at]) > least_slip
+        return ~moves & np.any(moves, axis=1)[:, None] & slips
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
