@@ -177,7 +177,7 @@ class Constraints:
         return int(normals), int(tangents)
 
     @cached_property
-    def _empty(self) -> Array:
+    def empty(self) -> Array:
         """Flags of local rows without entries."""
         return np.asarray(np.diff(self.B.getValuesCSR()[0]) == 0)
 
@@ -192,7 +192,7 @@ class Constraints:
         Where no force moves a row it slips whatever bounds it: it has no share of a bound of ∞.
         """
         at, limits = self.pressed, self.limits.copy()
-        sticks = np.isinf(pressures)[:, None] & self._empty[self.sets.tangents[at]]
+        sticks = np.isinf(pressures)[:, None] & self.empty[self.sets.tangents[at]]
         mu = np.where(sticks, 0.0, self.coefficients[at])
         limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
         return replace(self, limits=limits)
