@@ -46,6 +46,8 @@ def test_discs_ellipses_intervals_and_their_product_fulfil_the_contract(seed, si
     check_feasible_set(Product(sets), 26, seed)
     for one, rows in ((discs(size * radius), 6), (discs(size * radius, 1), 3), (sets[2][1], 8)):
         check_feasible_set(one, rows, seed)
+    far = Ellipses(np.array([[1.0, 2.0]])).project(np.array([1e200, 1e200]))
+    assert far == pytest.approx(np.array([1.0, 4.0]) / 5**0.5)
 
 
 @given(SEEDS, st.floats(-6, 6))

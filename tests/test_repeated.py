@@ -294,13 +294,10 @@ def test_an_update_that_raises_has_changed_nothing(pair):
 
 
 def test_coefficients_that_become_zero_leave_no_friction():
-    d = decomposed("quadrilateral", 4, 2)
-    field = fem.Function(fem.functionspace(d.mesh, ("DG", 0)))
-    number = fem.Constant(d.mesh, 0.0)
+    d, plane = decomposed("quadrilateral", 4, 2), tfeti.Plane((0, 0), (0, 1))
+    field, number = fem.Function(fem.functionspace(d.mesh, ("DG", 0))), fem.Constant(d.mesh, 0.0)
     for mu, given in ((field, field.x.array), (number, number.value)):
-        law = tfeti.Coulomb(mu)
-        contact = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), friction=law)
-        p = problem(d, (0.02, -0.07), [contact])
+        p = problem(d, (0.02, -0.07), [tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(mu))])
         for value in (0.02, 0.0, 0.02):
             given[...] = value
             p.solve()

@@ -32,7 +32,7 @@ from tfeti_dolfinx.forms.checks import (
     displacement_space,
     is_axisymmetric,
 )
-from tfeti_dolfinx.forms.dirichlet import check_conditions, listed_conditions
+from tfeti_dolfinx.forms.dirichlet import Prescribed, check_conditions, listed_conditions
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -514,8 +514,8 @@ class ContactProblem:
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been. Collective.
 
-        Constants, functions, values, gaps and points must be those that the state was found with;
-        laws of rigid bodies may have others.
+        Constants, functions, gaps and points must be those that the state was found with; laws of
+        rigid bodies and values of Dirichlet conditions may be others.
 
         Args:
             state: What ``state`` returned on this rank.
@@ -538,7 +538,11 @@ class ContactProblem:
         dual = system.make(self._seconds)
         dual.seen = max(dual.seen, float(state.norm))
         state = state.on_rows(system.gluing)
-        gluing = replace(system.gluing, slip=state.slip)
+        # what conditions prescribed then: by now they may have other values
+        flag = system.gluing.prescribed.flag
+        values = self.dofs.reduce(state.u.reshape(-1, self.dofs.bs), np.maximum)
+        held = Prescribed(flag, np.where(flag, values, 0.0))
+        gluing = replace(system.gluing, slip=state.slip, prescribed=held)
         dual.learn()
         if dual.recycled is not None:
             dual.recycled.take(state.directions)

@@ -308,7 +308,8 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
     found = dict[str, bool]()
     for f in fields(state):
         values, kind = getattr(state, f.name), OF.get(f.name)
-        right = bool(np.all(np.isfinite(values)))
+        numbers = ~np.isnan(values) if f.name == "reach" else np.isfinite(values)  # it may be ∞
+        right = bool(np.all(numbers))
         if kind is not None:
             wanted = len(getattr(state, kind)) * (dofs.bs if kind == "nodes" else 1)
             right &= len(values) in (wanted, 0 if f.default_factory is not MISSING else wanted)

@@ -15,7 +15,14 @@ from tfeti_dolfinx.constraints.gluing import Gluing, glue
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.friction import Coulomb
 from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
-from tfeti_dolfinx.contact.records import ContactRecords, Friction, condition_areas, slips
+from tfeti_dolfinx.contact.records import (
+    ContactRecords,
+    Friction,
+    condition_areas,
+    given_slips,
+    mean_of_copies,
+    slips,
+)
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -550,7 +557,9 @@ class System(Generic[OwnForms]):
         slip = slips(begun, self._dofs, self._rest)
         if not self._has_friction:
             return slip, slip
-        return slip, slips(begun, self._dofs, self._rest, made(self._prescribed).flag)
+        flag = made(self._prescribed).flag
+        given = np.where(flag, mean_of_copies(self._dofs, self._rest), 0.0)
+        return slip, given_slips(begun, self._dofs, flag, given)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:

@@ -25,7 +25,7 @@ from tfeti_dolfinx.constraints.rows import (
     assemble_constraints,
     stack,
 )
-from tfeti_dolfinx.contact.records import ContactRecords, Friction, relative_motion
+from tfeti_dolfinx.contact.records import ContactRecords, Friction, given_slips, relative_motion
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError
 from tfeti_dolfinx.forms.dirichlet import Prescribed
@@ -121,13 +121,14 @@ class Gluing:
                 f"prescribed: {overlaps} node{'s penetrate' if overlaps > 1 else ' penetrates'} by "
                 f"up to {-deepest:.6g} whatever the rest does"
             )
-        along = np.einsum("ntg,ng->nt", records.tangents, held)
-        slips = (self.slip - along)[tangents.condition]
         c = np.zeros(self.constraints.num_rows)
         c[sets.equalities] = self.to_equalities @ self.prescribed.value.ravel()
         c[sets.normals] = left[normals.condition] * normals.scale
-        slides = tangents.moves | tangents.drawn
-        c[sets.tangents] = np.where(slides, slips * tangents.scale[:, None], 0.0)
+        if self.constraints.contact_rows[1]:
+            along, at = np.einsum("ntg,ng->nt", records.tangents, held), tangents.condition
+            slips = np.where(tangents.moves, (self.slip - along)[at], -self._given_slip[at])
+            slides = tangents.moves | tangents.drawn
+            c[sets.tangents] = np.where(slides, slips * tangents.scale[:, None], 0.0)
         return c
 
     def closed(self) -> Array:
@@ -141,8 +142,7 @@ class Gluing:
         They are those of conditions with friction and a normal row; others are not numbers.
         Collective.
         """
-        along = np.einsum("ntg,ng->nt", self.records.tangents, self._held[0])
-        return np.where(self._forced(), along - self.slip, np.nan)
+        return np.where(self._forced(), self._given_slip, np.nan)
 
     def _forced(self) -> Array:
         """Return flags of tangents that are prescribed, of conditions with friction and a row."""
@@ -151,6 +151,12 @@ class Gluing:
         forced[self.records.friction == Friction.NONE] = False
         forced[self.tangents.condition] &= ~self.tangents.moves
         return forced
+
+    @cached_property
+    def _given_slip(self) -> Array:
+        """Slips of prescribed components, ``(n, gdim - 1)``. Collective at first use."""
+        flag, value = self.prescribed.flag, self.prescribed.value
+        return given_slips(self.records, self.dofs, flag, value) - self.slip
 
     @cached_property
     def _held(self) -> tuple[Array, Array, Array]:
@@ -191,14 +197,13 @@ class Gluing:
     def _drawn(self) -> Array:
         """Return ``TangentRows.drawn``: slips that are more than rounding. Collective."""
         moves, at = self.tangents.moves, self.tangents.condition
-        if self.dofs.bs < 3:
+        if self.dofs.bs < 3 or not self.constraints.contact_rows[1]:
             return np.zeros_like(moves)
         values, motion = self.prescribed.value, self.records.motion
         known = np.concatenate([x.ravel() for x in (values, motion, self.slip)])
         least_slip = TOLERANCES.still * largest(self.dofs.comm, known)
-        along = np.einsum("ntg,ng->nt", self.records.tangents[at], self._held[0][at])
-        slips = np.abs(along - self.slip[at])
-        return ~moves & np.any(moves, axis=1)[:, None] & (slips > least_slip)
+        slips = np.abs(self._given_slip[at]) > least_slip
+        return ~moves & np.any(moves, axis=1)[:, None] & slips
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.

@@ -176,15 +176,24 @@ class Constraints:
         normals, tangents = summed(self.B.getComm().tompi4py(), own)
         return int(normals), int(tangents)
 
+    @cached_property
+    def empty(self) -> Array:
+        """Flags of local rows without entries."""
+        return np.asarray(np.diff(self.B.getValuesCSR()[0]) == 0)
+
     @property
     def pressed(self) -> Array:
         """Positions of the points of ``sets.tangents`` with a coefficient of Coulomb's law."""
         return np.flatnonzero(np.any(self.coefficients > 0.0, axis=1))
 
     def with_pressures(self, pressures: Array) -> Constraints:
-        """The same rows with the ψ_i = μ_i λ_N,i of Coulomb's law, λ_N of ``pressed``; ∞ sticks."""
+        """The same rows with the ψ_i = μ_i λ_N,i of Coulomb's law, λ_N of ``pressed``; ∞ sticks.
+
+        Where no force moves a row it slips whatever bounds it: it has no share of a bound of ∞.
+        """
         at, limits = self.pressed, self.limits.copy()
-        mu = self.coefficients[at]
+        sticks = np.isinf(pressures)[:, None] & self.empty[self.sets.tangents[at]]
+        mu = np.where(sticks, 0.0, self.coefficients[at])
         limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
         return replace(self, limits=limits)
 

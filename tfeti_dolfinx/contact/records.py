@@ -120,23 +120,33 @@ def relative_motion(records: ContactRecords, dofs: TornDofs, values: Array) -> A
     return sum_rows(records.condition, records.weight[:, None] * u, len(records))
 
 
-def relative_displacement(
-    records: ContactRecords, dofs: TornDofs, u: Array, flag: Array | bool = True
-) -> Array:
-    """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective.
-
-    Flags of components of the owned groups, shape ``(g, gdim)``, leave others out.
-    """
-    total = dofs.reduce(u.reshape(-1, dofs.bs), np.add)
-    return (
-        relative_motion(records, dofs, flag * total / dofs.multiplicity[:, None]) - records.motion
-    )
+def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
+    """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective."""
+    return relative_motion(records, dofs, mean_of_copies(dofs, u)) - records.motion
 
 
-def slips(records: ContactRecords, dofs: TornDofs, u: Array, flag: Array | bool = True) -> Array:
+def mean_of_copies(dofs: TornDofs, u: Array) -> Array:
+    """Return the means of torn copies, of the owned groups, ``(g, gdim)``. Collective."""
+    return np.asarray(dofs.reduce(u.reshape(-1, dofs.bs), np.add) / dofs.multiplicity[:, None])
+
+
+def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     """Return the v_i along the tangents of the frames, shape ``(n, gdim - 1)``. Collective."""
-    v = relative_displacement(records, dofs, u, flag)
-    return np.einsum("ntg,ng->nt", records.tangents, v)
+    return np.einsum("ntg,ng->nt", records.tangents, relative_displacement(records, dofs, u))
+
+
+def given_slips(records: ContactRecords, dofs: TornDofs, flag: Array, values: Array) -> Array:
+    """Return what prescribed components make of the v_i along the tangents. Collective.
+
+    What they leave of a condition moves with them: else parts of a body that is carried along would
+    slip over each other. Flags and values are those of the owned groups, ``(g, gdim)``, values 0
+    where nothing is prescribed.
+    """
+    signless = replace(records, weight=np.abs(records.weight))
+    sums, weights = (relative_motion(signless, dofs, of) for of in (values, flag.astype(float)))
+    left = relative_motion(records, dofs, (~flag).astype(float))
+    motion = relative_motion(records, dofs, values) - records.motion
+    return np.einsum("ntg,ng->nt", records.tangents, motion + left * quotient(sums, weights))
 
 
 def held_pressures(

@@ -93,14 +93,16 @@ class LawPoint:
 class LawProgram:
     """The law and Gλ = e, as one equation. All methods are collective.
 
-    With y = λ − s/‖F‖ and P the projection onto Ω(y_N⁺) it is the natural map of Coulomb's law:
-    λ = P(y) and Gλ = e.
+    With y = λ − ρs/‖F‖ and P the projection onto Ω(y_N⁺) it is the natural map of Coulomb's law:
+    λ = P(y) and Gλ = e, whatever ρ > 0 each point has.
     """
 
     qp: QP  # F, d and G; its set is not looked at
     law: Law  # the sets
     oblique: Callable[[Face, Following], Coarse]  # Gλ = e of λ = (I + C)u, u in a face
     norm: float  # ‖F‖, or an estimate
+    # ρ of rows: more than 1 where rows that F knows nothing of slip, and reach their bound at once
+    reach: Array | float = 1.0
 
     def natural_map(self, at: LawPoint) -> tuple[FeasibleSet, Array, float]:
         """Return Ω(y_N⁺), p = P(y), and ‖F‖ times what λ misses of the law and of Gλ = e.
@@ -108,7 +110,7 @@ class LawProgram:
         That is ‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks; but no less than what
         rounding leaves of s, as of bodies that nothing holds and that have gone far away.
         """
-        coarse, y = self.qp.coarse, at.lam - at.s / self.norm
+        coarse, y = self.qp.coarse, at.lam - self.reach * at.s / self.norm
         feasible = self.law.at(np.maximum(y[self.law.normals], 0.0))
         p = feasible.project(y)
         balancing = coarse.combined(coarse.solve(coarse.residual(at.lam)))

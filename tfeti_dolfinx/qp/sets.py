@@ -262,6 +262,8 @@ class Product:
 
 # of the boundary's distance from the centre: what is so near to the boundary is on it
 ON = 1e-10
+# of the longer semi-axis: how far a point may be, and how short the other may be
+FAR, THIN = 1e100, 1e-150
 # Newton's method for the secular equation: far more steps than it takes, and where it ends
 MOST_STEPS, SOLVED = 60, 9e-16
 
@@ -288,7 +290,8 @@ class Ellipses:
     def project(self, x: Array) -> Array:
         """Return the nearest points of the ellipses."""
         t = x.reshape(self.semi_axes.shape)
-        outside = _lengths(t * self._inverse) > 1.0
+        with np.errstate(over="ignore"):  # farther than numbers go is outside
+            outside = _lengths(t * self._inverse) > 1.0
         nearest = np.where(self._moves, t, 0.0)
         if np.any(outside):
             nearest[outside] = self._nearest(t[outside], outside)
@@ -354,12 +357,14 @@ class Ellipses:
         a = self.semi_axes[which]
         if np.all(a == a[:, :1]):  # discs and intervals
             return np.asarray(a * (z / _lengths(z)[:, None]))
-        scale = np.maximum(a.max(axis=1, initial=TINY), TINY)[:, None]
-        a, z = a / scale, z / scale
+        # from so far only the direction counts; squares stay in the range of floating point
+        z, scale = np.where(a > 0.0, z, 0.0), np.maximum(a.max(axis=1), TINY)[:, None]
+        given, z = a / scale, z / np.maximum(scale, np.abs(z).max(axis=1)[:, None] / FAR)
+        a = np.where(given > 0.0, np.maximum(given, THIN), 0.0)
         y = a * a * z / np.maximum(a * a + _secular(a, z)[:, None], TINY)
         # the last rounding of μ must not leave y off the boundary
         level = np.linalg.norm(quotient(y, a), axis=1)
-        return np.asarray(scale * y / np.maximum(level, TINY)[:, None])
+        return np.asarray(scale * y * quotient(given, a) / np.maximum(level, TINY)[:, None])
 
 
 def _lengths(x: Array) -> Array:
@@ -375,7 +380,7 @@ def _secular(a: Array, z: Array) -> Array:
     """
     c = a * np.abs(z)
     mu = np.max(c - a * a, axis=1, initial=-np.inf)  # one term alone is 1 there
-    outside = np.sum(quotient(c, a * a) ** 2, axis=1) >= 1.0
+    outside = np.hypot.reduce(quotient(c, a * a), axis=1) >= 1.0
     mu = np.where(outside, np.maximum(mu, 0.0), mu)
     for _ in range(MOST_STEPS):
         below = a * a + mu[:, None]
