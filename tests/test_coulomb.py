@@ -209,8 +209,7 @@ def test_what_sticks_where_a_wall_pushes_slips():
     p.solve()
     x, u = displacement(p)
     assert u[np.isclose(x[:, 0], 0.0), 0].min() >= 0.01 - 1e-9
-    data = [p.solution.contact(k) for k in (0, 1)]
-    for one in data:
+    for one in map(p.solution.contact, (0, 1)):
         size = np.linalg.norm(one.tangential_traction, axis=1)
         assert np.all(size <= 0.3 * one.pressure + 1e-8)
 
