@@ -84,7 +84,7 @@ def test_a_block_that_is_drawn_by_its_side_rubs_there_too(cell, law, comm):
     p = tfeti.ContactProblem(a, L, bcs, [floor(gdim, law)], d, petsc_options=options)
     for way.value, force in ((0.5, -0.003), (-0.5, 0.003), (-0.5, None)):
         p.solve()
-        assert p.report.F_multiplications < 25
+        assert p.report.F_multiplications < 35
         data, pulls = p.solution.contact(), -p.solution.reaction("left").force[0]
         assert data.resultant.force[0] == pytest.approx(pulls, abs=1e-10)
         if force:

@@ -101,7 +101,7 @@ class LawProgram:
     law: Law  # the sets
     oblique: Callable[[Face, Following], Coarse]  # Gλ = e of λ = (I + C)u, u in a face
     norm: float  # ‖F‖, or an estimate
-    # ρ of rows: more than 1 where rows that F knows nothing of slip, and reach their bound at once
+    # ρ of rows: more than 1 where rows that F knows nothing of slip, and have to reach their bound
     reach: Array | float = 1.0
 
     def natural_map(self, at: LawPoint) -> tuple[FeasibleSet, Array, float]:

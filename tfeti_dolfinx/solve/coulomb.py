@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tfeti_dolfinx.common.arrays import TINY, Array, quotient, sums
+from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.common.parallel import any_rank, largest, norm_over, steering, summed
 from tfeti_dolfinx.feti.dual import Dual
@@ -57,7 +57,7 @@ class CoulombParameters:
     no_force: float = 1e-13
     # of the largest forces of normals on a body: those of a lighter one count as so large
     light: float = 1e-6
-    over: float = 10.0  # over the bounds at a start: those that Newton's method meets are less
+    reach: float = 10.0  # ρ of the natural map at points that are made to slip
     rounding: float = 2e-16  # of ‖F‖‖λ‖, or of ‖d‖: no residual is less
     # of what bends, of gaps and of what is prescribed: a slip without end. It is below 10 where
     # friction holds, below 1e3 where it holds 1e-6 more than the load, 1e4 and more where it fails
@@ -408,12 +408,10 @@ class NewtonOnLaw:
         dual.seen = dual.seen or seen_norm(qp, Point(start[0], Fx - qp.d))
         if (norm := dual.seen) == 0.0:
             return None
-        # what is made to slip along a row without entries has all of its bound
-        given = np.linalg.norm(np.where(rows.empty, rows.c, 0.0)[tangents], axis=1)
-        mu = np.max(rows.coefficients[at], axis=1, initial=0.0)
-        bound = parameters.over * mu * largest(dual.coarse.comm, start[0][normals])
+        # what is made to slip along a row without entries
+        drawn = np.any(rows.empty[tangents] & (rows.c[tangents] != 0.0), axis=1)
         reach = np.ones(rows.num_rows)
-        reach[tangents] = np.maximum(1.0, norm * quotient(bound, given))[:, None]
+        reach[tangents[drawn]] = parameters.reach
         program = LawProgram(qp, law, dual.coarse.oblique, norm, reach)
         points = []
         for c in dict.fromkeys((1.0, growth(qp.coarse, start[0]))):
