@@ -531,17 +531,16 @@ class ContactProblem:
         system = self._system
         system.tools.go_back(state.tools)
         self._take_motion(state)
-        secondary = list(map(int, state.secondary))
-        system.know_rows(list(state.reach), state.groups(self.dofs), secondary)
+        sides = list(map(int, state.secondary))
+        system.know_rows(list(state.reach), state.groups(self.dofs), sides)
         system.look_for_changes()
         system.tools.go_back(state.tools)  # by now laws may have others
         dual = system.make(self._seconds)
         dual.seen = max(dual.seen, float(state.norm))
         state = state.on_rows(system.gluing)
         # what conditions prescribed then: by now they may have other values
-        flag = system.gluing.prescribed.flag
         values = self.dofs.reduce(state.u.reshape(-1, self.dofs.bs), np.maximum)
-        held = Prescribed(flag, np.where(flag, values, 0.0))
+        held = Prescribed(flag := system.gluing.prescribed.flag, np.where(flag, values, 0.0))
         gluing = replace(system.gluing, slip=state.slip, prescribed=held)
         dual.learn()
         if dual.recycled is not None:

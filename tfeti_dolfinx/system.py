@@ -536,10 +536,7 @@ class System(Generic[OwnForms]):
         self._equals.kept.clear()
 
     def _slip(self) -> tuple[Array, Array]:
-        """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``.
-
-        And those of prescribed components alone.
-        """
+        """Tangential v_i where the load step begins, and those of prescribed components alone."""
         records = self.search.records
         if self._rest is None:
             return (np.zeros(records.tangents.shape[:2]),) * 2
