@@ -462,7 +462,7 @@ class System(Generic[OwnForms]):
         gluing = replace(self.gluing, records=replace(self.gluing.records, motion=records.motion))
         self._gluing = gluing.with_right_side(values, records.gap, self._slip())
         before, after = gluing.tangents.drawn, self._gluing.tangents.drawn
-        if any_rank(self._dofs.comm, not np.array_equal(before, after)):
+        if self._has_friction and any_rank(self._dofs.comm, not np.array_equal(before, after)):
             self.change("friction")
 
     def _set_friction_limits(self) -> None:

@@ -16,7 +16,7 @@ from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
-from tfeti_dolfinx.contact.records import relative_displacement
+from tfeti_dolfinx.contact.records import mean_of_copies, relative_displacement
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
@@ -137,9 +137,8 @@ class Predictor:
         """
         dofs, constraints = self._dofs, gluing.constraints
         before, primal = np.array(constraints.c), dofs.to_primal(w)
-        total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add)
-        values = total / dofs.multiplicity[:, None]
-        constraints.c[constraints.sets.equalities] = gluing.to_equalities @ values.ravel()
+        values = mean_of_copies(dofs, primal).ravel()
+        constraints.c[constraints.sets.equalities] = gluing.to_equalities @ values
         try:
             self._make(M, M @ w, gluing)
             return dofs.to_dolfinx(self._solve(gluing))
