@@ -61,7 +61,7 @@ class Group:
             return False
         once = self.work * (3.0 if self.columns == 1 else self.columns)
         dense = 2.0 * self.size**2 * self.columns
-        times = choice.multiplications * (2 if self.stiffness and self.columns == 1 else 1)
+        times = choice.multiplications * (2 if self.stiffness else 1)
         return times * (once - dense) > self.work * self.size
 
     def take_dense(self, A: Array) -> None:
