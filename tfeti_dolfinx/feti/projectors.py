@@ -153,7 +153,7 @@ class NullModes:
 
 
 class DenseFactor:
-    """A = L Lᵀ of a small matrix: to call a sparse factor takes longer than this.
+    """A = L Lᵀ of a matrix of few rows, where a call of a sparse factor takes longer than its work.
 
     Creation raises a NotPositiveDefiniteError where A is not positive definite.
     """
@@ -163,7 +163,8 @@ class DenseFactor:
         dense[np.repeat(np.arange(len(dense)), np.diff(A.indptr)), A.indices] = A.data
         self._L, failed = dpotrf(dense, lower=True)
         if failed or not np.isfinite(self._L).all():
-            raise NotPositiveDefiniteError(f"pivot {failed} is not positive")
+            raise NotPositiveDefiniteError("not positive definite (found by LAPACK)")
+        self.entries = float(self._L.size)
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""

@@ -53,7 +53,7 @@ class Group:
         """Return whether the group takes a dense matrix: by its type, or for fewer operations.
 
         It costs as many solves as it has columns. A single right side reads the factor for itself,
-        as long as three of many take; with a dense K⁺ of one Block comes S, as often multiplied by.
+        as long as three of many take; with a dense K⁺ comes S, as often multiplied by.
         """
         if choice.type in ("implicit", "explicit") or not self.can_be_dense:
             return self.can_be_dense and choice.type == "explicit"
