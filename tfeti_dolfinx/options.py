@@ -202,6 +202,8 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
                 f"{word} on the command line did not reach PETSc; call petsc4py.init(sys.argv) "
                 "before dolfinx is imported"
             )
+    if not named:
+        return Options()
     known = {option.name: option for option in parameters_of(Options)}
     for name in named:
         if name not in known and not FACTOR_OPTION.fullmatch(name):

@@ -123,7 +123,10 @@ class Diagnostics:
             lasting = (self._cells, self._locking(dual.subdomains, nodes), self._hinges)
             self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             # mean slopes of a displacement of each subdomain, (gdim, nodes)
-            self._slopes = [np.linalg.pinv(x.T @ x, EPSILON * len(x), True) @ x.T for x in nodes]
+            gdim = self._decomposition.mesh.geometry.dim
+            grams = np.reshape([x.T @ x for x in nodes], (-1, gdim, gdim))
+            inverse = np.linalg.pinv(grams, EPSILON * np.array([len(x) for x in nodes]), True)
+            self._slopes = [A @ x.T for A, x in zip(inverse, nodes, strict=True)]
         u = solution.u
         return [
             *_loose(outcome),

@@ -105,12 +105,17 @@ def plus(A: Any, row: Array, column: Array, value: Array) -> Entries:
     """Return A plus these entries, in the order of rows and of columns, as those of a CSR A are."""
     if not len(row):
         return Entries(A.data, A.indices, A.indptr, A.shape)
-    rows, which = np.unique(row, return_inverse=True)
+    first = np.append(True, row[1:] != row[:-1])
+    rows, which = row[first], np.cumsum(first) - 1
     entries, begins = entries_of_rows(A, rows)
     own = np.repeat(np.arange(len(rows)), np.diff(begins)) * A.shape[1] + A.indices[entries]
     place = np.searchsorted(own, wanted := which * A.shape[1] + column)
     new = np.searchsorted(own, wanted, side="right") == place
     place += A.indptr[row] - begins[which]
+    if not new.any():
+        data = np.array(A.data)
+        data[place] += value
+        return Entries(data, A.indices, A.indptr, A.shape)
     data = np.insert(A.data, place[new], value[new])
     data[(place + np.cumsum(new))[~new]] += value[~new]
     indices = np.insert(A.indices, place[new], column[new])

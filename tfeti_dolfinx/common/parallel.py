@@ -112,6 +112,9 @@ class Exchange:
 
     def __init__(self, comm: MPI.Intracomm, destination: Array) -> None:
         self._comm = comm
+        if comm.size == 1:
+            self.source = np.zeros(len(destination), dtype=np.int64)
+            return
         self._order = np.argsort(destination, kind="stable")
         self._sent = np.bincount(destination, minlength=comm.size).astype(np.int64)
         self._received = np.empty_like(self._sent)

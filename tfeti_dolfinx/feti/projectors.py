@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.sparse import coo_array, csc_array, csr_array, eye_array
 from scipy.sparse.linalg import splu
 
@@ -124,6 +126,7 @@ def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
 
 # Added to a unit diagonal, where pivots are lost to rounding, as on faces that leave a body free
 SHIFTS = (0.0, 1e-14, 1e-13, 1e-12)
+DENSE = 100  # rows of a matrix whose factor is dense
 
 
 class NullModes:
@@ -149,6 +152,25 @@ class NullModes:
         return pinned
 
 
+class DenseFactor:
+    """A = L Lᵀ of a matrix of few rows, where a call of a sparse factor takes longer than its work.
+
+    Creation raises a NotPositiveDefiniteError where A is not positive definite.
+    """
+
+    def __init__(self, A: Entries | csr_array) -> None:
+        dense = np.zeros(A.shape)
+        dense[np.repeat(np.arange(len(dense)), np.diff(A.indptr)), A.indices] = A.data
+        self._L, failed = dpotrf(dense, lower=True)
+        if failed or not np.isfinite(self._L).all():
+            raise NotPositiveDefiniteError("not positive definite (found by LAPACK)")
+        self.entries = float(self._L.size)
+
+    def solve(self, b: Array) -> Array:
+        """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
+        return np.asarray(dpotrs(self._L, b, lower=True)[0])
+
+
 class SemidefiniteFactor:
     """A⁺ of a sparse positive semidefinite A, the same on all ranks, on each of them. Collective.
 
@@ -168,8 +190,9 @@ class SemidefiniteFactor:
         prefix: str = "tfeti_coarse_",
     ) -> None:
         self._null, (self._scale, pinned) = null, _scaling(A, null)
+        few = A.shape[0] <= DENSE and not PETSc.Options(prefix).getAll()
         scaled = _scaled(A, self._scale, pinned)
-        self._factor: CholeskyFactor | None = None
+        self._factor: CholeskyFactor | DenseFactor | None = None
         self._shift = 0.0
         for self._shift in SHIFTS if A.shape[0] else ():
             lost = False
@@ -179,7 +202,7 @@ class SemidefiniteFactor:
                     if self._shift:  # only refinement needs the matrix
                         self._A = scaled.csr()
                         shifted = csr_array(self._A + self._shift * eye_array(A.shape[0]))
-                    self._factor = CholeskyFactor(shifted, prefix)
+                    self._factor = DenseFactor(shifted) if few else CholeskyFactor(shifted, prefix)
                 except FactorError as error:
                     lost = isinstance(error, NotPositiveDefiniteError)
                     if not lost or self._shift == SHIFTS[-1]:

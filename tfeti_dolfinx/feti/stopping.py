@@ -189,13 +189,13 @@ class Criterion(NamedTuple):
     def ratio(self, rounds: bool = True) -> float:
         """Return the error over what it may be, with rounding or without."""
         most = self.allowed + self.rounding if rounds else self.allowed
-        return float(np.max(self.error / np.maximum(most, TINY), initial=0.0))
+        return float(np.asarray(self.error / np.maximum(most, TINY)).max(initial=0.0))
 
     def relative(self) -> tuple[float, float]:
         """Return the error and what it may be over the size, of the worst body."""
         size = np.maximum(self.size, TINY)
-        error, most = self.error / size, (self.allowed + self.rounding) / size
-        return float(np.max(error, initial=0.0)), float(np.max(most, initial=0.0))
+        error, most = map(np.asarray, (self.error / size, (self.allowed + self.rounding) / size))
+        return float(error.max(initial=0.0)), float(most.max(initial=0.0))
 
 
 @dataclass(frozen=True)

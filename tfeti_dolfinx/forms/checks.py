@@ -13,9 +13,8 @@ from ufl.algorithms.check_arities import ArityMismatch
 from ufl.conditional import Conditional, MaxValue
 from ufl.constantvalue import ScalarValue, Zero
 from ufl.core.terminal import FormArgument
-from ufl.corealg.traversal import unique_post_traversal, unique_pre_traversal
+from ufl.corealg.traversal import traverse_unique_terminals, unique_post_traversal
 from ufl.differentiation import Derivative
-from ufl.domain import extract_domains
 from ufl.geometry import SpatialCoordinate
 from ufl.indexed import Indexed
 from ufl.mathfunctions import Sqrt
@@ -173,19 +172,14 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
     Constants may be from any: they are numbers.
     """
     domain = decomposition.mesh.ufl_domain()
-    elsewhere = any(d != domain for d in extract_domains(expression))
-    for term in unique_pre_traversal(expression):
-        if not term._ufl_is_terminal_:
-            continue
+    for term in traverse_unique_terminals(expression):
         for kind, expected in ((ufl.Coefficient, fem.Function), (ufl.Constant, fem.Constant)):
             if isinstance(term, kind) and not isinstance(term, expected):
                 raise InputError(
                     f"{name}: {term} is a ufl.{kind.__name__}, which has no values; expected a "
                     f"dolfinx.fem.{expected.__name__}"
                 )
-        if not elsewhere or isinstance(term, ufl.Constant):
-            continue
-        if any(d != domain for d in extract_domains(term)):
+        if not isinstance(term, ufl.Constant) and any(d != domain for d in term.ufl_domains()):
             what, how = f"{type(term).__name__} {term}", ""
             if isinstance(term, fem.Function):
                 what = f"function {term.name!r}"

@@ -53,7 +53,7 @@ class Group:
         """Return whether the group takes a dense matrix: by its type, or for fewer operations.
 
         It costs as many solves as it has columns. A single right side reads the factor for itself,
-        as long as three of many take; with a dense K⁺ of one Block comes S, as often multiplied by.
+        as long as three of many take; with a dense K⁺ comes S, as often multiplied by.
         """
         if choice.type in ("implicit", "explicit") or not self.can_be_dense:
             return self.can_be_dense and choice.type == "explicit"
@@ -61,7 +61,7 @@ class Group:
             return False
         once = self.work * (3.0 if self.columns == 1 else self.columns)
         dense = 2.0 * self.size**2 * self.columns
-        times = choice.multiplications * (2 if self.stiffness and self.columns == 1 else 1)
+        times = choice.multiplications * (2 if self.stiffness else 1)
         return times * (once - dense) > self.work * self.size
 
     def take_dense(self, A: Array) -> None:
