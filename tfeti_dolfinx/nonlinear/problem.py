@@ -368,8 +368,7 @@ class NonlinearContactProblem(ContactProblem):
         warns &= self._settings.options.warnings
         atol = max(self._atol, self._last_digit)
         self.options = replace(self.options, rtol=rtol, atol=atol, warnings=warns)
-        if self._places is not None:
-            self._go_to_places(self._places)
+        self._go_to_places()
         try:
             self._system.look_for_changes()
             self._solve_in_rounds()
@@ -386,11 +385,13 @@ class NonlinearContactProblem(ContactProblem):
             self._set(u)
             self._solve_linearised(rtol, warns)
 
-    def _go_to_places(self, places: CurrentPlaces) -> None:
-        """Let contact and rigid motions be those of X + u. Collective."""
-        places.move(anew=not self._system.forms.kept)
+    def _go_to_places(self) -> None:
+        """Let contact and rigid motions be those of X + u, in finite strain. Collective."""
+        if self._places is None:
+            return
+        self._places.move(anew=not self._system.forms.kept)
         if not self._system.forms.kept:
-            moved = (self.u.x.array, places.moved)
+            moved = (self.u.x.array, self._places.moved)
             self._system.origin = np.stack([self.dofs.to_primal(u) for u in moved])
         self._system.begin_at(self.dofs.to_primal(self._begin))
 
@@ -543,8 +544,7 @@ class NonlinearContactProblem(ContactProblem):
         self._begin, self._system.weights = self.dofs.to_dolfinx(state.u), state.weights
         self._system.forms.kept, self._keeping.freezes = False, bool(state.freezes)
         self._set(self._begin)
-        if self._places is not None:
-            self._go_to_places(self._places)
+        self._go_to_places()
 
     def _negligible(self, subdomains: Subdomains) -> Array:
         begin = subdomains.with_rigid(self.dofs.to_primal(self._begin))

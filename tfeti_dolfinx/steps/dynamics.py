@@ -471,7 +471,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         last = np.array(self.u.x.array)
         if self._places is not None:  # the prediction is that of the begin of the step
             self._set(self._begin)
-            self._go_to_places(self._places)
+            self._go_to_places()
         try:
             self._system.look_for_changes()
             self._set_out()
