@@ -354,6 +354,7 @@ class ContactProblem:
             stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
         )
+        solution.finite = self._system.origin is not None
         solution.boundary = self._system.elements.solved(u)
         solution.tool_motions, solution.friction = tools.motions(), self._system.known_friction
         return solution

@@ -102,14 +102,10 @@ LIMITS = WarningLimits()
 
 
 class Diagnostics:
-    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
-
-    With ``finite`` kinematics are not linear, so that bodies may turn.
-    """
+    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again."""
 
     def __init__(self, dofs: TornDofs) -> None:
         self._decomposition, self._dofs = dofs.decomposition, dofs
-        self.finite = False
         self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
         self._slopes: list[Array] = []
@@ -128,7 +124,7 @@ class Diagnostics:
         return [
             *_loose(outcome),
             *self._rounding(dual, u, energy, rtol),
-            *self._turned(u, dual.subdomains),
+            *([] if solution.finite else self._turned(u, dual.subdomains)),
             *self._facets(solution, dual.subdomains),
             *self._lasting,
             *of_estimates(outcome),
@@ -200,7 +196,7 @@ class Diagnostics:
     def _turned(self, u: Array, subdomains: Subdomains) -> Iterator[str]:
         """Bodies that turn farther than linear kinematics bears."""
         bs = self._dofs.bs
-        if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
+        if bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
         turns = []
         for (_, part), slope_of in zip(subdomains.elastic_parts, self._slopes, strict=True):

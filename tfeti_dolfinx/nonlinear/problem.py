@@ -12,7 +12,6 @@ from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sum_rows, sums
 from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
-from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
 from tfeti_dolfinx.errors import (
     ConvergenceError,
@@ -28,9 +27,7 @@ from tfeti_dolfinx.nonlinear.materials import derivative_of, laws_of
 from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonTolerances
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
-from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.system import System
 
@@ -168,7 +165,6 @@ class NonlinearContactProblem(ContactProblem):
         self._keeping = ModelKeeping(self._tolerances, finite)
         self._last_increment = self._loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
-        self._diagnostics.finite = self._finite
         if finite:
             self._check_rotations()
 
@@ -550,11 +546,6 @@ class NonlinearContactProblem(ContactProblem):
         begin = subdomains.with_rigid(self.dofs.to_primal(self._begin))
         share = self._tolerances.negligible * self._exact
         return np.asarray(share * subdomains.body_sizes([begin])[0])
-
-    def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
-        solution = super()._make_solution(u, lam, face, gluing)
-        solution.finite = self._finite
-        return solution
 
     def _return(self) -> None:
         super()._return()
