@@ -154,7 +154,7 @@ class NonlinearContactProblem(ContactProblem):
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
-        self._exact, self._atol = self.options.number, self.options.atol
+        self._exact = self.options.number
         self._system.follows = True
         self._begin = self._first
         self._system.begin_at(self.dofs.to_primal(self._begin))
@@ -184,8 +184,7 @@ class NonlinearContactProblem(ContactProblem):
             self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:
-            warns = self._settings.options.warnings
-            self.options = replace(self.options, rtol=self._exact, atol=self._atol, warnings=warns)
+            self.options = self._settings.options
 
     def _newton(self) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
@@ -361,9 +360,9 @@ class NonlinearContactProblem(ContactProblem):
         A kept model without an answer, as its places may hold no body that turns, is made anew.
         """
         u, again = np.array(self.u.x.array), False
-        warns &= self._settings.options.warnings
-        atol = max(self._atol, self._last_digit)
-        self.options = replace(self.options, rtol=rtol, atol=atol, warnings=warns)
+        given = self._settings.options
+        atol, warns = max(given.atol, self._last_digit), warns and given.warnings
+        self.options = replace(given, rtol=rtol, atol=atol, warnings=warns)
         self._go_to_places()
         try:
             self._system.look_for_changes()

@@ -148,19 +148,18 @@ class Predictor:
     def _make(self, M: csr_array, f: Array, gluing: Gluing) -> None:
         """Make what is out of date."""
         constraints, settings, dofs = gluing.constraints, self._settings, self._dofs
-        new_rows = self._dual is None or self._dual.constraints is not constraints
         if M is not self._M:
             self.destroy()
             data = subdomain_data(dofs, dofs.decomposition, M, f, constraints.trace)
             equals = EqualSubdomains(settings.inverses())
             self._subdomains = settings.make_subdomains(data, dofs, equals)
-            self._M, new_rows = M, True
+            self._M = M
         assert self._subdomains is not None
         self._subdomains.update(f=dofs.to_primal(f))
-        if not new_rows and self._dual is not None:
-            self._dual.update_load()
-            return
         if self._dual is not None:
+            if self._dual.constraints is constraints:
+                self._dual.update_load()
+                return
             self._dual.destroy()
             self._subdomains.retrace(constraints.trace)
         self._dual, self._options = settings.make_dual(
