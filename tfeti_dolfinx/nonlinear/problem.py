@@ -488,9 +488,9 @@ class NonlinearContactProblem(ContactProblem):
         Raises:
             InputError: As ``ContactProblem.accept``.
         """
-        before, _ = self._accepted
+        before = self._accepted
         super().accept()
-        if self._accepted[0] is not before:
+        if self._accepted is not before:
             self._state.commit()
             self._begin = np.array(self.u.x.array)
             self._set(self._begin)

@@ -278,9 +278,7 @@ class ContactDynamics(ContactProblem):
         tools = self._system.tools
         tools.read(self.time)
         tools.begin = [tools.pose(i) for i in range(len(tools))]
-        self._predictor: Predictor | None = None
-        if self._stabilised:
-            self._predictor = Predictor(self.dofs, self._settings)
+        self._predictor = Predictor(self.dofs, self._settings) if stabilised else None
 
     def _given_besides(self) -> dict[str, Any]:
         flags = {"stabilised": self._stabilised, "lumped": self._lumped}
@@ -335,12 +333,11 @@ class ContactDynamics(ContactProblem):
         Raises:
             InputError: As ``ContactProblem.accept``.
         """
-        before, _ = self._accepted
+        before = self._accepted
         super().accept()
-        if self.solution is before:
-            return
-        assert self.solution.v is not None
-        self._system.forms.inertia.move(np.array(self.u.x.array), self.solution.v)
+        if self._accepted is not before:
+            assert self.solution.v is not None
+            self._system.forms.inertia.move(np.array(self.u.x.array), self.solution.v)
 
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
