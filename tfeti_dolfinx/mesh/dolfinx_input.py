@@ -16,7 +16,7 @@ from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, is_whole, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names
+from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names, flags_of
 from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner
 from tfeti_dolfinx.mesh.tearing import TORN, decomposed
 from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_facets
@@ -151,8 +151,7 @@ def _located(
     tag = int(mesh.comm.allreduce(own, op=MPI.MAX))
     locate = dmesh.locate_entities_boundary if facets else dmesh.locate_entities
     for name in mesh.comm.bcast(list(markers)):  # ranks may order them differently
-        marker = markers[name]
-        flags = partial(_flags, f"{what}[{name!r}]", marker)
+        flags = partial(flags_of, markers[name], what=f"{what}[{name!r}]")
         with raised_on_all_ranks(mesh.comm), named(f"{what}[{name!r}]"):
             found = locate(mesh, dim, flags)
         if not any_rank(mesh.comm, len(found) > 0):
@@ -170,17 +169,6 @@ def _located(
         values[found], names[name] = tag, tag
     indices = np.flatnonzero(values != NO_TAG).astype(np.int32)
     return names, dmesh.meshtags(mesh, dim, indices, values[indices])
-
-
-def _flags(name: str, marker: Marker, x: Array) -> Array:
-    """Return the flags of a marker, which DOLFINx would take from numbers, too."""
-    flags = np.asarray(marker(x))
-    if flags.dtype != bool or flags.shape != x.shape[1:]:
-        raise InputError(
-            f"{name}: the marker returns {flags.dtype} of shape {flags.shape}; "
-            f"expected bool of shape {x.shape[1:]}, a flag for each point"
-        )
-    return flags
 
 
 def _checked_mesh(mesh: Any) -> dmesh.Mesh:
