@@ -1,5 +1,6 @@
 """Diagnostics of a solution: the warnings of the report."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +16,6 @@ from tfeti_dolfinx.common.compat import geometry_degree, geometry_dofmap
 from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest
 from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
 from tfeti_dolfinx.mortar.facets import create_element
@@ -48,27 +48,6 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     volume = np.abs((J[0] * adjugate[0]).sum(axis=0))
     sizes = np.sqrt((J**2).sum(axis=(0, 1)) * (adjugate**2).sum(axis=(0, 1)))
     return np.asarray(sizes / np.maximum(gdim * volume, TINY * sizes))
-
-
-def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
-    """Pairs of bodies with nodes in common, ``(p, 2)``, and how many, ``(p,)``. Collective."""
-    comm, mesh = decomposition.comm, decomposition.mesh
-    if decomposition.num_bodies == 1:
-        return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64)
-    geometry = geometry_dofmap(mesh)
-    body = np.zeros(len(decomposition.original_nodes), dtype=np.int64)
-    body[geometry] = decomposition.body_of_subdomain[decomposition.cell_subdomain][:, None]
-    node = np.unique(facet_points(mesh, decomposition.boundary))
-    ids = decomposition.original_nodes[node].astype(np.int64)
-    exchange = Exchange(comm, ids % comm.size)
-    met = np.stack((exchange.send(ids), exchange.send(body[node])), axis=1)
-    met = np.unique(met, axis=0)
-    same = met[1:, 0] == met[:-1, 0]
-    local = np.stack((met[:-1, 1], met[1:, 1]), axis=1)[same]
-    own, count = np.unique(local, axis=0, return_counts=True)  # few pairs, however many nodes
-    every, counts = map(np.concatenate, zip(*comm.allgather((own, count)), strict=True))
-    pairs, place = np.unique(every, axis=0, return_inverse=True)
-    return pairs, np.bincount(place.ravel(), counts, minlength=len(pairs)).astype(np.int64)
 
 
 # --- Warnings ---------------------------------------------------------------------------------
@@ -144,11 +123,26 @@ class Diagnostics:
     @cached_property
     def _hinges(self) -> list[str]:
         """Bodies that a mesh joins in nodes alone."""
-        names = self._decomposition.body_names
+        d, names = self._decomposition, self._decomposition.body_names
+        if d.num_bodies == 1:
+            return []
+        body = np.zeros(len(d.original_nodes), dtype=np.int64)
+        body[geometry_dofmap(d.mesh)] = d.body_of_subdomain[d.cell_subdomain][:, None]
+        node = np.unique(facet_points(d.mesh, d.boundary))
+        ids = d.original_nodes[node].astype(np.int64)
+        exchange = Exchange(d.comm, ids % d.comm.size)
+        met = np.stack((exchange.send(ids), exchange.send(body[node])), axis=1)
+        met = np.unique(met, axis=0)
+        same = met[1:, 0] == met[:-1, 0]
+        local = np.stack((met[:-1, 1], met[1:, 1]), axis=1)[same]
+        own, own_counts = np.unique(local, axis=0, return_counts=True)  # few, however many nodes
+        shared = Counter[tuple[int, int]]()
+        for pairs, counts in d.comm.allgather((own.tolist(), own_counts.tolist())):
+            shared.update(dict(zip(map(tuple, pairs), counts, strict=True)))
         return [
             f"{names[a]}, {names[b]}: the mesh joins them in nodes alone ({count}), in no facet: "
             "they are bodies of their own, and not joined; expected a common facet"
-            for (a, b), count in zip(*shared_by_bodies(self._decomposition), strict=True)
+            for (a, b), count in sorted(shared.items())
         ]
 
     def _locking(self, subdomains: Subdomains, nodes: Sequence[Array]) -> Iterator[str]:
