@@ -256,8 +256,9 @@ class Checkpoint:
                 counts = np.concatenate([arrays[name + COUNTS] for arrays in found.values()])
                 rows = np.concatenate([arrays[name] for arrays in found.values()])
                 labels = numbered(np.repeat(known, counts))
-                own = np.isin(labels >> SHIFT, self._subdomains)
-                table[name] = rows[own], labels[own]
+                order = np.argsort(labels)
+                order = order[np.isin(labels[order] >> SHIFT, self._subdomains)]
+                table[name] = rows[order], labels[order]
         return table
 
     def _commit(self, index: Index) -> None:
