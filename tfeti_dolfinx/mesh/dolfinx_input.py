@@ -90,12 +90,11 @@ def decompose(
         mesh = data.mesh
         cell_tags = data.cell_tags if cell_tags is None else cell_tags
         facet_tags = data.facet_tags if facet_tags is None else facet_tags
-        names: dict[int, dict[str, int | Marker]] = {dim - 1: {}, dim: {}}
-        for name, (of, tag) in data.physical_groups.items():
-            if of in names and name:
-                names[of][name] = tag
-        surfaces = (names[dim - 1] or None) if surfaces is None else surfaces
-        volumes = (names[dim] or None) if volumes is None else volumes
+        groups = [(of, name, tag) for name, (of, tag) in data.physical_groups.items() if name]
+        if surfaces is None:
+            surfaces = {name: tag for of, name, tag in groups if of == dim - 1} or None
+        if volumes is None:
+            volumes = {name: tag for of, name, tag in groups if of == dim} or None
     mesh = _checked_mesh(mesh)
     tagged = ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags"))
     with agreeing(mesh.comm, "decompose") as given:

@@ -133,8 +133,17 @@ class Material(ABC):
         selective: bool,
         volumes: Volumes,
     ) -> None:
-        check_law(elasticity, u, name := type(self).__name__)
-        self.elasticity, self.u, on = elasticity, u, elasticity.on
+        name = type(self).__name__
+        checked_type(elasticity, Elasticity, "elasticity", "a tfeti_dolfinx.Elasticity")
+        checked_type(u, fem.Function, "u", "a dolfinx.fem.Function")
+        if elasticity.model == "plane_stress":
+            raise InputError(
+                f"{name}: plane stress is not there; expected plane strain, axisymmetric or 3d"
+            )
+        mesh, on = elasticity.mesh, elasticity.on
+        if u.function_space.mesh is not mesh:
+            raise InputError(f"{name}: u is on another mesh than the elasticity")
+        self.elasticity, self.u = elasticity, u
         self.volumes: list[int] | None = None
         self.state: Mapping[fem.Function, NewValue] = {}
         self._inside: fem.Function | None = None
@@ -149,8 +158,7 @@ class Material(ABC):
             inside = {"subdomain_data": on.cell_tags, "subdomain_id": tuple(self.volumes)}
             self._inside = fem.Function(fem.functionspace(on.mesh, ("DG", 0)))
             self._inside.x.array[self._rows_of(self._inside)] = 1.0
-        mesh, own = elasticity.mesh, u.function_space.element.basix_element.degree
-        cell = mesh.basix_cell()
+        own, cell = u.function_space.element.basix_element.degree, mesh.basix_cell()
         simplex = cell in (basix.CellType.triangle, basix.CellType.tetrahedron)
         self._selective = checked_flag(selective, "selective")
         if selective and (simplex or own != 1):
@@ -447,15 +455,3 @@ def derivative_of(F: ufl.Form, u: fem.Function, laws: Sequence[Material]) -> ufl
     v, w = J.arguments()
     of_laws = [law.of_update(F, w, v) for law in laws if isinstance(law, J2Plasticity)]
     return sum(of_laws, J)
-
-
-def check_law(elasticity: Any, u: Any, name: str) -> None:
-    """Raise unless a law fits a displacement."""
-    checked_type(elasticity, Elasticity, "elasticity", "a tfeti_dolfinx.Elasticity")
-    checked_type(u, fem.Function, "u", "a dolfinx.fem.Function")
-    if elasticity.model == "plane_stress":
-        raise InputError(
-            f"{name}: plane stress is not there; expected plane strain, axisymmetric or 3d"
-        )
-    if u.function_space.mesh is not elasticity.mesh:
-        raise InputError(f"{name}: u is on another mesh than the elasticity")
