@@ -506,7 +506,7 @@ class System(Generic[OwnForms]):
             again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
         )
         self._subdomains = self._settings.make_subdomains(
-            subdomain_data(dofs, dofs.decomposition, self._K, self._f, trace),
+            subdomain_data(dofs, self._K, self._f, trace),
             dofs,
             self._equals,
             self.elements.blocks,

@@ -143,7 +143,7 @@ class Predictor:
             # 1. what is out of date
             if M is not self._M:
                 self.destroy()
-                data = subdomain_data(dofs, dofs.decomposition, M, f, constraints.trace)
+                data = subdomain_data(dofs, M, f, constraints.trace)
                 equals = EqualSubdomains(settings.inverses())
                 self._subdomains, self._M = settings.make_subdomains(data, dofs, equals), M
             assert self._subdomains is not None
