@@ -158,9 +158,8 @@ class Predictor:
                     constraints,
                     self._subdomains,
                     dofs,
-                    lambda rows: contact_set(
-                        replace(rows, limits=0.0 * rows.limits)
-                    ),  # no friction
+                    # without friction
+                    lambda rows: contact_set(replace(rows, limits=0.0 * rows.limits)),
                 )
             # 2. the program, from the last multipliers on
             dual, options, start = self._dual, self._options, None
