@@ -35,7 +35,7 @@ def test_blocks_keep_their_promises(cell, n):
         [np.empty(0, dtype=np.int64)]
         + [parts._unknowns(s).start + np.flatnonzero(p.on_surface) for s, p in parts.parts.items()]
     )
-    data = subdomain_data(dofs, d, K, np.zeros(dofs.num_nodes * dofs.bs), trace)
+    data = subdomain_data(dofs, K, np.zeros(dofs.num_nodes * dofs.bs), trace)
     for block, part in zip(map(parts.blocks(None), data), parts.parts.values(), strict=True):
         check_block(block, part.shape.K[part.place][:, part.place])
 

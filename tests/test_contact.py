@@ -202,9 +202,6 @@ def test_a_choice_that_is_much_the_worse_one_is_warned_of(caplog):
     assert warned == (MPI.COMM_WORLD.rank == 0)
 
 
-SIDES = ("upper bottom", "lower top")
-
-
 def below(distance, **changes):
     return tfeti.Obstacle("bottom", tfeti.Plane((0, -distance), (0, 1)), **changes)
 
@@ -224,7 +221,7 @@ def test_an_obstacle_that_is_never_touched_changes_nothing(distance):
 @pytest.mark.parametrize("distance", [0.1, 1e3])
 def test_a_pair_that_never_touches_changes_nothing(distance):
     found = []
-    for contacts in ([], [sided(*SIDES)]):
+    for contacts in ([], [sided(UPPER, LOWER)]):
         d = stacked("triangle", 3, 4, 4, gap=distance)
         sides = ["lower bottom", "lower left", "upper top", "upper left"]
         p = solved(two_body_problem(d, pressed(d, 1e-3, "upper right"), held(d, *sides), contacts))
@@ -236,7 +233,7 @@ def test_a_pair_that_never_touches_changes_nothing(distance):
 def test_who_meets_nobody_is_said(caplog):
     d = stacked("quadrilateral", 3, 4, 4)
     sides = ["lower bottom", "lower left", "upper left"]
-    contacts = [sided(*SIDES), sided("upper right", "lower right")]
+    contacts = [sided(UPPER, LOWER), sided("upper right", "lower right")]
     contacts += [tfeti.Obstacle("lower top", tfeti.Plane((0, 30), (0, -1)))]
     p = solved(two_body_problem(d, pressed(d), held(d, *sides), contacts))
     unmet = ["1: contact of 'upper right' with 'lower right'", "2: obstacle of surface 'lower top'"]
@@ -262,11 +259,12 @@ def test_the_reach_does_not_change_the_answer(reach):
 def test_a_punch_from_afar_presses_by_little(rtol):
     """Its way, of which rtol is a part, says nothing of how deep it presses."""
     d = stacked("quadrilateral", 3, 4, 4, gap=0.3)
-
     sides = ["lower bottom", "lower left", ("upper top", -0.3005), "upper left"]
     forces = []
     for one in (rtol, 1e-10):
-        p = solved(two_body_problem(d, pressed(d, 0.0), held(d, *sides), [sided(*SIDES)], rtol=one))
+        p = solved(
+            two_body_problem(d, pressed(d, 0.0), held(d, *sides), [sided(UPPER, LOWER)], rtol=one)
+        )
         forces.append(p.solution.contact(0).resultant.force[1])
     assert forces[1] > 1e-4
     assert forces[0] == pytest.approx(forces[1], rel=rtol)
@@ -282,7 +280,7 @@ def test_a_body_that_only_a_far_obstacle_holds():
     assert np.isclose(gathered(p.solution.contact(0).force).sum(), 0.01)
 
 
-@pytest.mark.parametrize("reach", [0.0, np.nan, "1", True])
+@pytest.mark.parametrize("reach", [-1.0, 0.0, np.nan, "1", True])
 def test_a_reach_that_is_none(reach):
     p = problem(decomposed("quadrilateral", 4), contacts=[below(0.1, reach=reach)])
     with pytest.raises(tfeti.InputError, match="obstacle of surface 'bottom': reach=.*, expected"):

@@ -159,7 +159,7 @@ def test_markers_name_surfaces_and_volumes(comm):
     [
         ({"top": lambda x: x[1] > 2}, r"surfaces\['top'\]: the marker finds no facet"),
         ({"top": lambda x: x[7] > 2}, r"surfaces\['top'\]: IndexError"),
-        ({"top": lambda x: x[1]}, r"surfaces\['top'\]: .* returns float64 of"),
+        ({"top": lambda x: x[1]}, r"surfaces\['top'\]: .* got float64 of"),
         ({"top": lambda x: True}, r"surfaces\['top'\]: .* bool of shape \(\)"),
         (
             {"top": lambda x: x[1] > 0.99, "right": lambda x: (x[0] > 0.99) | (x[1] > 0.99)},

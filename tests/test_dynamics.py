@@ -357,8 +357,7 @@ def multiplications(scene, cold=False, **options):
     for _ in range(steps):
         if cold:
             problem._start = None
-        problem.solve()
-        problem.accept()
+        accepted(problem)
         if any(np.linalg.norm(force) > 0.0 for force in problem.report.contact_forces):
             counts.append(problem.report.F_multiplications)
     problem.destroy()

@@ -7,7 +7,7 @@ from bodies import held, torn_boxes
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import accepted, clamp, integral, unknowns
+from scenes import accepted, clamp, integral, solved, unknowns
 from scipy.optimize import brentq
 
 import tfeti_dolfinx as tfeti
@@ -279,8 +279,7 @@ def test_stresses_at_nodes_are_those_of_the_points(cell, comm):
     law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=0.1)
     bcs, F = [clamp(V, decomposition.facets("side"), given)], law.residual(v)
     more = {"stress": law.stress, "petsc_options": {"rtol": 1e-10}}
-    problem = tfeti.NonlinearContactProblem(F, u, bcs, [], decomposition, **more)
-    problem.solve()
+    problem = solved(tfeti.NonlinearContactProblem(F, u, bcs, [], decomposition, **more))
     mu = E / 2 / (1 + NU)
     q = np.sqrt(3.0) * mu * 0.04
     expected = q - 3.0 * mu * (q - 0.01) / (3.0 * mu + 0.1)

@@ -203,7 +203,6 @@ def test_obstacle_under_a_uniform_pressure(cell, degree):
 @pytest.mark.parametrize(
     ("sides", "changes", "message"),
     [
-        (("upper bottom", "lower top"), {"reach": -1.0}, "reach=-1.0, expected a positive length"),
         (("upper bottom", "lower bottom"), {"reach": 2.0}, "face away from each other"),
         (
             ("upper bottom", "lower top"),

@@ -156,7 +156,7 @@ class ContactProblem:
         # flags of the bodies that move freely in the last solution, if contact has held some
         self._let_go: Array = np.zeros(0, dtype=bool)
         self._start: Start | None = None
-        self._accepted: tuple[Solution | None, Start | None] = (None, None)
+        self._accepted: tuple[Solution, Start] | None = None
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
         if self.contacts:
@@ -354,6 +354,7 @@ class ContactProblem:
             stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
         )
+        solution.finite = self._system.origin is not None
         solution.boundary = self._system.elements.solved(u)
         solution.tool_motions, solution.friction = tools.motions(), self._system.known_friction
         return solution
@@ -464,15 +465,15 @@ class ContactProblem:
             InputError: There is no solution, or the solver stopped before its tolerance.
         """
         with agreeing(self.decomposition.comm, "accept"):
-            solution = self.solution
-            if self._start is None:
+            solution, start = self.solution, self._start
+            if start is None:
                 raise InputError("the last solve has not converged; expected one that has")
-        if solution is self._accepted[0] or self._start is None:
+        if start is None or (self._accepted and self._accepted[0] is solution):
             return
         tools = self._system.tools
         tools.begin = [tools.pose(i) for i in range(len(tools))]
         self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
-        self._accepted = (solution, self._start)
+        self._accepted = (solution, start)
 
     def go_back(self) -> None:
         """Return to the last accepted solution, or to what ``u`` was at first. Collective.
@@ -485,7 +486,7 @@ class ContactProblem:
 
     def _return(self) -> None:
         """Return to the last accepted solution. Not collective."""
-        self._solution, self._start = self._accepted
+        self._solution, self._start = self._accepted or (None, None)
         self._system.tools.go_back()
         last = self._solution
         self.u.x.array[:] = self._first if last is None else self.dofs.to_dolfinx(last.u)
@@ -496,12 +497,11 @@ class ContactProblem:
         Raises:
             InputError: No solution was accepted.
         """
-        solution, start = self._accepted
         with agreeing(self.decomposition.comm, "state"):
-            if solution is None or start is None:
+            if self._accepted is None:
                 raise InputError("there is no state yet; expected a call of accept() before")
-        assert solution is not None
-        assert start is not None
+        assert self._accepted is not None
+        solution, start = self._accepted
         (reach, _), dual = self._system.search.rows(), self._system.dual
         state = SavedState.of(solution, start[2], dual.seen, reach)
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())

@@ -407,9 +407,8 @@ class System(Generic[OwnForms]):
     # ------------------------------------------------------------------- stages
 
     def _assemble_stiffness(self) -> None:
-        K = self.forms.stiffness()
-        self._blocks = self.elements.node_blocks(K, self.how)
-        self._K = K
+        self._K = self.forms.stiffness()
+        self._blocks = self.elements.node_blocks(self._K, self.how)
         if self.elements.replaces:  # the load that a force per volume makes depends on S
             self.change("load")
 
@@ -507,7 +506,7 @@ class System(Generic[OwnForms]):
             again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
         )
         self._subdomains = self._settings.make_subdomains(
-            subdomain_data(dofs, dofs.decomposition, self._K, self._f, trace),
+            subdomain_data(dofs, self._K, self._f, trace),
             dofs,
             self._equals,
             self.elements.blocks,

@@ -1,5 +1,6 @@
 """Diagnostics of a solution: the warnings of the report."""
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +16,6 @@ from tfeti_dolfinx.common.compat import geometry_degree, geometry_dofmap
 from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest
 from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
 from tfeti_dolfinx.mortar.facets import create_element
@@ -50,27 +50,6 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     return np.asarray(sizes / np.maximum(gdim * volume, TINY * sizes))
 
 
-def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
-    """Pairs of bodies with nodes in common, ``(p, 2)``, and how many, ``(p,)``. Collective."""
-    comm, mesh = decomposition.comm, decomposition.mesh
-    if decomposition.num_bodies == 1:
-        return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64)
-    geometry = geometry_dofmap(mesh)
-    body = np.zeros(len(decomposition.original_nodes), dtype=np.int64)
-    body[geometry] = decomposition.body_of_subdomain[decomposition.cell_subdomain][:, None]
-    node = np.unique(facet_points(mesh, decomposition.boundary))
-    ids = decomposition.original_nodes[node].astype(np.int64)
-    exchange = Exchange(comm, ids % comm.size)
-    met = np.stack((exchange.send(ids), exchange.send(body[node])), axis=1)
-    met = np.unique(met, axis=0)
-    same = met[1:, 0] == met[:-1, 0]
-    local = np.stack((met[:-1, 1], met[1:, 1]), axis=1)[same]
-    own, count = np.unique(local, axis=0, return_counts=True)  # few pairs, however many nodes
-    every, counts = map(np.concatenate, zip(*comm.allgather((own, count)), strict=True))
-    pairs, place = np.unique(every, axis=0, return_inverse=True)
-    return pairs, np.bincount(place.ravel(), counts, minlength=len(pairs)).astype(np.int64)
-
-
 # --- Warnings ---------------------------------------------------------------------------------
 
 ESTIMATES = "estimates"  # how the sentence on them begins
@@ -102,14 +81,10 @@ LIMITS = WarningLimits()
 
 
 class Diagnostics:
-    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
-
-    With ``finite`` kinematics are not linear, so that bodies may turn.
-    """
+    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again."""
 
     def __init__(self, dofs: TornDofs) -> None:
         self._decomposition, self._dofs = dofs.decomposition, dofs
-        self.finite = False
         self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
         self._slopes: list[Array] = []
@@ -131,7 +106,7 @@ class Diagnostics:
         return [
             *_loose(outcome),
             *self._rounding(dual, u, energy, rtol),
-            *self._turned(u, dual.subdomains),
+            *([] if solution.finite else self._turned(u, dual.subdomains)),
             *self._facets(solution, dual.subdomains),
             *self._lasting,
             *of_estimates(outcome),
@@ -151,11 +126,26 @@ class Diagnostics:
     @cached_property
     def _hinges(self) -> list[str]:
         """Bodies that a mesh joins in nodes alone."""
-        names = self._decomposition.body_names
+        d, names = self._decomposition, self._decomposition.body_names
+        if d.num_bodies == 1:
+            return []
+        body = np.zeros(len(d.original_nodes), dtype=np.int64)
+        body[geometry_dofmap(d.mesh)] = d.body_of_subdomain[d.cell_subdomain][:, None]
+        node = np.unique(facet_points(d.mesh, d.boundary))
+        ids = d.original_nodes[node].astype(np.int64)
+        exchange = Exchange(d.comm, ids % d.comm.size)
+        met = np.stack((exchange.send(ids), exchange.send(body[node])), axis=1)
+        met = np.unique(met, axis=0)
+        same = met[1:, 0] == met[:-1, 0]
+        local = np.stack((met[:-1, 1], met[1:, 1]), axis=1)[same]
+        own, own_counts = np.unique(local, axis=0, return_counts=True)  # few, however many nodes
+        shared = Counter[tuple[int, int]]()
+        for pairs, counts in d.comm.allgather((own.tolist(), own_counts.tolist())):
+            shared.update(dict(zip(map(tuple, pairs), counts, strict=True)))
         return [
             f"{names[a]}, {names[b]}: the mesh joins them in nodes alone ({count}), in no facet: "
             "they are bodies of their own, and not joined; expected a common facet"
-            for (a, b), count in zip(*shared_by_bodies(self._decomposition), strict=True)
+            for (a, b), count in sorted(shared.items())
         ]
 
     def _locking(self, subdomains: Subdomains, nodes: Sequence[Array]) -> Iterator[str]:
@@ -203,7 +193,7 @@ class Diagnostics:
     def _turned(self, u: Array, subdomains: Subdomains) -> Iterator[str]:
         """Bodies that turn farther than linear kinematics bears."""
         bs = self._dofs.bs
-        if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
+        if bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
         turns = []
         for (_, part), slope_of in zip(subdomains.elastic_parts, self._slopes, strict=True):

@@ -91,7 +91,7 @@ class Tools:
         if len(set(names)) < len(names):
             raise InputError(f"rigid bodies have the names {names}; expected different ones")
         self._sizes = [max(float(np.linalg.norm(high - low)) for low, high in own) for own in boxes]
-        free = [body.indices(gdim) for body in self.bodies] if self.bodies else []
+        free = [body.indices(gdim) for body in self.bodies]
         count, k = len(self.bodies), len(MOTIONS.get(gdim, ()))
         self.tool = np.repeat(np.arange(count), [len(own) for own in free])
         self.mode = np.concatenate([np.zeros(0, dtype=np.int64), *free])
@@ -186,11 +186,11 @@ class Tools:
 
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""
-        found = []
-        for i, (body, pose) in enumerate(zip(self.bodies, self.poses, strict=True)):
-            contacts = np.flatnonzero(self.of_contact == i)
-            found.append(ToolMotion(body.name, self.pose(i).motion, pose.centre, contacts))
-        return found
+        contacts = [np.flatnonzero(self.of_contact == i) for i in range(len(self))]
+        return [
+            ToolMotion(body.name, self.pose(i).motion, self.poses[i].centre, contacts[i])
+            for i, body in enumerate(self.bodies)
+        ]
 
     def take(self, values: Array) -> None:
         """Take the unknowns of a solution, this rank's, shape ``(num_local,)``. Collective."""

@@ -82,10 +82,7 @@ class Forms:
         given = {"form_compiler_options": form_compiler_options, "jit_options": jit_options}
         for name, options in given.items():
             checked_type(options, (Mapping, type(None)), name, "a dictionary")
-        self._keywords = {
-            "form_compiler_options": dict(form_compiler_options or {}),
-            "jit_options": dict(jit_options or {}),
-        }
+        self._keywords = {name: dict(options or {}) for name, options in given.items()}
         self._data = {"points": Data(lambda: [V.mesh.geometry.x], decomposition.comm)}
         self.replace_stiffness(a)
         self.replace_load(L)

@@ -8,7 +8,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse import csr_array
 from ufl.algorithms.analysis import extract_arguments, extract_coefficients, extract_constants
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
@@ -157,10 +156,9 @@ def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     cells = np.asarray(function.function_space.dofmap.list)
     values = function.x.array.reshape(-1, function.function_space.dofmap.index_map_bs)
     layout = np.asarray(in_cells.function_space.dofmap.list).ravel()
-    weights = np.repeat(volume, cells.shape[1]), cells.ravel(), np.arange(cells.size + 1)
-    summing = csr_array(weights, shape=(cells.size, dofs.num_nodes)).T
-    terms = in_cells.x.array.reshape(-1, values.shape[1])[layout]
-    sums = np.column_stack((summing @ terms, summing @ np.ones(cells.size)))
+    weight = np.repeat(volume, cells.shape[1])[:, None]
+    terms = weight * in_cells.x.array.reshape(-1, values.shape[1])[layout]
+    sums = sum_rows(cells.ravel(), np.hstack((terms, weight)), dofs.num_nodes)
     sums = dofs.spread(dofs.reduce(sums[dofs.dolfinx_node], np.add))
     values[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
     return function

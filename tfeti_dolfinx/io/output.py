@@ -227,17 +227,16 @@ class Series:
         self._count, self._ended = 0, False
         self._files: list[SeriesFile] = []
         of_cells = cell_fields(solution) + cellwise
+        parts = {target: nodal + of_cells}
+        if target.suffix == ".bp":
+            parts = {target: nodal, target.with_name(f"{target.stem}_cells.bp"): of_cells}
         try:
-            if target.suffix != ".bp":
-                self._files.append(SeriesFile(target, nodal + of_cells))
-            else:
-                self._files.append(SeriesFile(target, nodal))
-                beside = target.with_name(f"{target.stem}_cells.bp")
-                self._files.append(SeriesFile(beside, of_cells))
+            for name, fields in parts.items():
+                self._files.append(SeriesFile(name, fields))
             self._growing = self._files if cellwise else self._files[:1]
-            if len(self._growing) < len(self._files):
-                self._files[1].write(0.0)
-                self._files[1].close()
+            for file in self._files[len(self._growing) :]:
+                file.write(0.0)
+                file.close()
         except TfetiError:  # on all ranks
             self.drop()
             raise

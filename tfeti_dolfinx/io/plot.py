@@ -253,11 +253,9 @@ def plot_friction(
             raise InputError("plot_friction: no contact of the solution has friction")
     data = [solution.contact(name) for name in chosen]
     gdim = data[0].normal.shape[1]
-    rows = [
-        (d.points[:, :gdim], d.tangential_traction - normal * d.pressure[:, None] * d.normal)
-        for d in data
-    ]
-    parts = comm.gather([(*row, d.status) for row, d in zip(rows, data, strict=True)], root=0)
+    forces = [d.tangential_traction - normal * d.pressure[:, None] * d.normal for d in data]
+    rows = [(d.points[:, :gdim], f, d.status) for d, f in zip(data, forces, strict=True)]
+    parts = comm.gather(rows, root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
             from matplotlib.figure import Figure

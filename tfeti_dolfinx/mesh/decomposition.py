@@ -262,13 +262,7 @@ class Decomposition:
             if len(facets) == 0:
                 return facets
             used, corner = np.unique(nodes, return_inverse=True)
-            with named("marker"):
-                flags = np.asarray(marker(self.mesh.geometry.x[used].T))
-            if flags.dtype != bool or flags.shape != used.shape:
-                raise InputError(
-                    f"marker: expected flags of shape {used.shape} for points of shape "
-                    f"(3, {len(used)}), got {flags.dtype} of shape {flags.shape}"
-                )
+            flags = flags_of(marker, self.mesh.geometry.x[used].T, "marker")
         return facets[np.all(flags[corner.reshape(nodes.shape)], axis=1)]
 
     def from_original(self, f: fem.Function) -> fem.Function:
@@ -329,6 +323,18 @@ class Decomposition:
     @cached_property
     def _cells(self) -> CellExchange:
         return CellExchange(self._untorn_mesh(), self.original_cells)
+
+
+def flags_of(marker: Callable[[Array], ArrayLike], x: Array, what: str) -> Array:
+    """Return a marker's flags at points, shape ``(3, n)``; DOLFINx would take numbers, too."""
+    with named(what):
+        flags = np.asarray(marker(x))
+    if flags.dtype != bool or flags.shape != x.shape[1:]:
+        raise InputError(
+            f"{what}: expected flags of shape {x.shape[1:]} for points of shape {x.shape}, "
+            f"got {flags.dtype} of shape {flags.shape}"
+        )
+    return flags
 
 
 def _tag(name: str | int, names: dict[str, int], kind: str) -> int:

@@ -149,7 +149,7 @@ class TornDofs:
         self.axisymmetric = False
         self.offsets = chunk_offsets(self.comm, self.num_nodes)
         origin, key = node_keys(V, decomposition)
-        self._find_groups(decomposition, origin[self.dolfinx_node], key[self.dolfinx_node])
+        self._find_groups(origin[self.dolfinx_node], key[self.dolfinx_node])
 
     def points(self) -> Array:
         """Return the place of each primal node, shape ``(n, 3)``."""
@@ -255,13 +255,13 @@ class TornDofs:
             found.append((asked, *self.lookup(groups[asked], *(c[jth] for c in columns))))
         return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
 
-    def _find_groups(self, decomposition: Decomposition, origin: Array, key: Array) -> None:
+    def _find_groups(self, origin: Array, key: Array) -> None:
         """Find all copies of each node, which meet on the rank that their key names.
 
         It tells each, of those on boundaries of subdomains, the owner: that of the lowest.
         """
-        body = decomposition.body_of_subdomain[self.node_subdomain]
-        key = mix(key + mix(body))
+        decomposition = self.decomposition
+        key = mix(key + mix(decomposition.body_of_subdomain[self.node_subdomain]))
         owner = np.full(self.num_nodes, self.comm.rank, dtype=np.int64)
         facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
         fdim = decomposition.mesh.topology.dim - 1

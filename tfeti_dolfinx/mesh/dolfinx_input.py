@@ -16,7 +16,7 @@ from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, is_whole, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names
+from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names, flags_of
 from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner
 from tfeti_dolfinx.mesh.tearing import TORN, decomposed
 from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_facets
@@ -90,12 +90,11 @@ def decompose(
         mesh = data.mesh
         cell_tags = data.cell_tags if cell_tags is None else cell_tags
         facet_tags = data.facet_tags if facet_tags is None else facet_tags
-        names: dict[int, dict[str, int | Marker]] = {dim - 1: {}, dim: {}}
-        for name, (of, tag) in data.physical_groups.items():
-            if of in names and name:
-                names[of][name] = tag
-        surfaces = (names[dim - 1] or None) if surfaces is None else surfaces
-        volumes = (names[dim] or None) if volumes is None else volumes
+        groups = [(of, name, tag) for name, (of, tag) in data.physical_groups.items() if name]
+        if surfaces is None:
+            surfaces = {name: tag for of, name, tag in groups if of == dim - 1} or None
+        if volumes is None:
+            volumes = {name: tag for of, name, tag in groups if of == dim} or None
     mesh = _checked_mesh(mesh)
     tagged = ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags"))
     with agreeing(mesh.comm, "decompose") as given:
@@ -151,8 +150,7 @@ def _located(
     tag = int(mesh.comm.allreduce(own, op=MPI.MAX))
     locate = dmesh.locate_entities_boundary if facets else dmesh.locate_entities
     for name in mesh.comm.bcast(list(markers)):  # ranks may order them differently
-        marker = markers[name]
-        flags = partial(_flags, f"{what}[{name!r}]", marker)
+        flags = partial(flags_of, markers[name], what=f"{what}[{name!r}]")
         with raised_on_all_ranks(mesh.comm), named(f"{what}[{name!r}]"):
             found = locate(mesh, dim, flags)
         if not any_rank(mesh.comm, len(found) > 0):
@@ -170,17 +168,6 @@ def _located(
         values[found], names[name] = tag, tag
     indices = np.flatnonzero(values != NO_TAG).astype(np.int32)
     return names, dmesh.meshtags(mesh, dim, indices, values[indices])
-
-
-def _flags(name: str, marker: Marker, x: Array) -> Array:
-    """Return the flags of a marker, which DOLFINx would take from numbers, too."""
-    flags = np.asarray(marker(x))
-    if flags.dtype != bool or flags.shape != x.shape[1:]:
-        raise InputError(
-            f"{name}: the marker returns {flags.dtype} of shape {flags.shape}; "
-            f"expected bool of shape {x.shape[1:]}, a flag for each point"
-        )
-    return flags
 
 
 def _checked_mesh(mesh: Any) -> dmesh.Mesh:

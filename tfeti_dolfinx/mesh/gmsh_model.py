@@ -27,13 +27,12 @@ PARTITION_GROUP = re.compile(r"_part\{\d+\}_physical\{(\d+)\}_dim\{(\d+)\}")
 
 @dataclass(frozen=True)
 class Elements:
-    """Elements of one gmsh type: its number and name, nodes, ids, tags, partitions.
+    """Elements of one gmsh type: its name, as "Triangle 3", nodes, ids, tags, partitions.
 
     The partition is -1 where gmsh has none.
     """
 
-    kind: int
-    kind_name: str
+    kind: str
     nodes: Array
     ids: Array
     tags: Array
@@ -167,15 +166,14 @@ def _elements(model: Any, dim: int) -> Elements | None:
             n = len(kind_ids)
             found.append(
                 Elements(
-                    kind=int(kind),
-                    kind_name=model.mesh.getElementProperties(kind)[0],
+                    kind=model.mesh.getElementProperties(kind)[0],
                     nodes=np.asarray(kind_nodes, dtype=np.int64).reshape(n, -1),
                     ids=np.asarray(kind_ids, dtype=np.int64),
                     tags=np.full(n, min(groups), dtype=np.int32),
                     partitions=np.full(n, parts[0] if len(parts) == 1 else -1, dtype=np.int64),
                 )
             )
-    kinds = list(dict.fromkeys(elements.kind_name for elements in found))
+    kinds = list(dict.fromkeys(elements.kind for elements in found))
     if len(kinds) > 1:
         raise InputError(f"elements of several types, {kinds}; expected one type of cell")
     return concatenated(found) if found else None

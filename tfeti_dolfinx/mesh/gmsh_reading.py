@@ -134,14 +134,14 @@ def check_shared(
 
 # gmsh's element types: DOLFINx's cell type and degree
 CELLS = {
-    2: ("triangle", 1),
-    3: ("quadrilateral", 1),
-    4: ("tetrahedron", 1),
-    5: ("hexahedron", 1),
-    9: ("triangle", 2),
-    10: ("quadrilateral", 2),
-    11: ("tetrahedron", 2),
-    12: ("hexahedron", 2),
+    "Triangle 3": ("triangle", 1),
+    "Quadrilateral 4": ("quadrilateral", 1),
+    "Tetrahedron 4": ("tetrahedron", 1),
+    "Hexahedron 8": ("hexahedron", 1),
+    "Triangle 6": ("triangle", 2),
+    "Quadrilateral 9": ("quadrilateral", 2),
+    "Tetrahedron 10": ("tetrahedron", 2),
+    "Hexahedron 27": ("hexahedron", 2),
 }
 
 
@@ -155,7 +155,7 @@ def untorn_mesh(
     """
     top = comm.allreduce(max((content.top for content in contents), default=0), op=MPI.MAX)
     with_cells = [content for content in contents if top in content.elements]
-    kind, kind_name = _one_kind(with_cells, top, comm)
+    kind = _one_kind(with_cells, top, comm)
     shape, degree = CELLS[kind]
     cell_type = dmesh.to_type(shape)
     gdim = dmesh.cell_dim(cell_type)
@@ -163,7 +163,7 @@ def untorn_mesh(
     element = basix.ufl.element("Lagrange", shape, degree, variant, shape=(gdim,))
     none = np.empty(0, dtype=np.int64)
     nodes = none.reshape(0, element.dim // gdim)
-    empty = Elements(kind, kind_name, nodes, none, none.astype(np.int32), none)
+    empty = Elements(kind, nodes, none, none.astype(np.int32), none)
     found = concatenated([empty, *(content.elements[top] for content in with_cells)])
     facets = [content.elements[top - 1] for content in contents if top - 1 in content.elements]
     all_ids = np.concatenate([empty.ids, *(content.node_ids for content in with_cells)])
@@ -210,28 +210,27 @@ def places(known: Array, ids: Array, wide: int = 4) -> Array:
     return table[ids - least]
 
 
-def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> tuple[int, str]:
-    """Return number and name of gmsh's type of all cells of all ranks."""
-    kinds: dict[int, tuple[str, str]] = {}
-    cells = [(content.elements[top], content.where) for content in contents]
-    own = [(found.kind, (found.kind_name, where)) for found, where in cells]
-    for kind, name_and_file in (pair for of_rank in comm.allgather(own) for pair in of_rank):
-        kinds.setdefault(kind, name_and_file)
+def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> str:
+    """Return gmsh's type of all cells of all ranks."""
+    kinds: dict[str, str] = {}  # where each is
+    own = [(content.elements[top].kind, content.where) for content in contents]
+    for kind, where in (pair for of_rank in comm.allgather(own) for pair in of_rank):
+        kinds.setdefault(kind, where)
     if not kinds or top < 2:
         raise InputError(
             "the mesh has no physical groups of cells; give the bodies (3D: volumes, 2D: "
             "surfaces) and the surfaces physical groups in gmsh"
         )
     if len(kinds) > 1:
-        text = " and ".join(f"{name!r} in {where}" for _, (name, where) in sorted(kinds.items()))
+        text = " and ".join(f"{kind!r} in {where}" for kind, where in kinds.items())
         raise InputError(f"cells of several types, {text}; expected one type of cell")
-    ((kind, (name, _)),) = kinds.items()
+    (kind,) = kinds
     if kind not in CELLS:
         raise InputError(
-            f"cells of type {name!r} are not supported; expected triangles, quadrilaterals, "
+            f"cells of type {kind!r} are not supported; expected triangles, quadrilaterals, "
             "tetrahedra or hexahedra of first or (complete) second order"
         )
-    return kind, name
+    return kind
 
 
 def _facet_tags(

@@ -56,18 +56,17 @@ class FiniteJ2Plasticity(Plasticity):
         elasticity, u = self.elasticity, self.u
         self._entries = ENTRIES[elasticity.model]
         m = len(self._entries)
-        scalar, vector = self._at.space(), self._at.space((m,))
+        scalar, vector = self._space(), self._space((m,))
         self.p = fem.Function(scalar, name="accumulated_plastic_strain")
-        self.inverse_plastic = fem.Function(self._at.space((6,)), name="inverse_plastic_strain")
+        self.inverse_plastic = fem.Function(self._space((6,)), name="inverse_plastic_strain")
         self.inverse_plastic.x.array[:] = np.tile(
             [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], len(self.p.x.array)
         )
-        self._mu, self._kappa = fem.Function(scalar), fem.Function(scalar)
         self._more, self._G = self._updated(scalar), self._updated(vector)
-        self._P, self._dP = self._updated(vector), self._updated(self._at.space((m, m)))
+        self._P, self._dP = self._updated(vector), self._updated(self._space((m, m)))
         points = interpolation_points(scalar)
-        self._mu_of_x = fem.Expression(elasticity.mu, points)
-        self._kappa_of_x = fem.Expression(self._bulk * ufl.as_ufl(1.0), points)
+        self._mu = fem.Expression(elasticity.mu, points)
+        self._kappa = fem.Expression(self._bulk * ufl.as_ufl(1.0), points)
         self._points = len(points)
         self._G_of_u = fem.Expression(self._gradient(u), points)
         self._new = (np.array(self.inverse_plastic.x.array), np.array(self.p.x.array))
@@ -80,8 +79,6 @@ class FiniteJ2Plasticity(Plasticity):
         """
         super().update()
         self._G.interpolate(self._G_of_u)
-        self._mu.interpolate(self._mu_of_x)
-        self._kappa.interpolate(self._kappa_of_x)
         own, p = self._rows, self.p.x.array[self._rows]
         F = np.zeros((len(p), 3, 3))
         rows, columns = np.array(self._entries).T
@@ -93,16 +90,16 @@ class FiniteJ2Plasticity(Plasticity):
         inverse_plastic = np.empty_like(F)
         for k, (i, j) in enumerate(SYMMETRIC):
             inverse_plastic[:, i, j] = inverse_plastic[:, j, i] = components[:, k]
-        hardening = self.hardening()
+        hardening, mu = self.hardening(), self._values_of(self._mu)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
-            point = _Return(F, inverse_plastic, p, self._mu.x.array[own], hardening)
+            point = _Return(F, inverse_plastic, p, mu, hardening)
         P, dP = point.P, point.tangent(self._entries)
         P[out] = dP[out] = np.nan
         dilatation = np.log(np.linalg.det(F))
-        if self._at.selective:  # that of the centre of the cell, nearly
+        if self._selective:  # that of the centre of the cell, nearly
             cells = dilatation.reshape(-1, self._points)
             dilatation = np.repeat(cells.mean(axis=1), self._points)
-        self._more.x.array[own] = point.missing(self._kappa.x.array[own], dilatation)
+        self._more.x.array[own] = point.missing(self._values_of(self._kappa), dilatation)
         self._P.x.array.reshape(-1, len(rows))[own] = P[:, rows, columns]
         m = len(rows) ** 2
         self._dP.x.array.reshape(-1, m)[own] = dP.reshape(-1, m)
@@ -122,7 +119,7 @@ class FiniteJ2Plasticity(Plasticity):
         """Return ∫P:∇v, whose derivative is that of the return."""
         thickness = self.elasticity.thickness
         F = ufl.Identity(3) + displacement_gradient(self.elasticity, self.u)
-        energy = thickness * self._bulk / 2 * ufl.ln(ufl.det(F)) ** 2 * self._at.dx_volume
+        energy = thickness * self._bulk / 2 * ufl.ln(ufl.det(F)) ** 2 * self._dx_volume
         way = self._gradient(self.u) - self._G
         P = self._P + ufl.dot(self._dP, way)
         inverse = ufl.inv(ufl.Identity(3) + self._tensor(self._G))

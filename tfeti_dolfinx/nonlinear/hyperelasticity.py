@@ -81,7 +81,7 @@ class Hyperelasticity(Material):
         """Return ∫P(u):∇v, P = ∂ψ/∂F, with a tangent that is definite on stretches."""
         thickness, F = self.elasticity.thickness, self.deformation(self.u)
         of_volume, of_shape = self.energies(F)
-        energy = thickness * of_shape * self.dx + thickness * of_volume * self._at.dx_volume
+        energy = thickness * of_shape * self.dx + thickness * of_volume * self._dx_volume
         here = self.deformation(self._here)
         inverse = ufl.inv(here)
         rate = ufl.sym((F - here) * inverse)

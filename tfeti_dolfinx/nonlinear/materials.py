@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, TypeAlias
 
@@ -107,63 +107,6 @@ class IsotropicHardening:
         )
 
 
-@dataclass(frozen=True)
-class Quadrature:
-    """Quadrature of a law, and the spaces of its points."""
-
-    mesh: Any  # the torn mesh
-    degree: int  # degree of the quadrature
-    selective: bool  # whether what resists a change of volume is integrated at the centre of a cell
-    inside: dict[str, Any] = field(default_factory=dict)  # of a measure of some volumes
-    # how far from the centre, of a reference cell of length 1, the two points of that rule are:
-    # FFCx 0.9 takes values at a single point for those of other rules, too, and values that differ
-    # by 1e-6 for the same; forces of a homogeneous strain are off by the square
-    beside: float = 1e-5
-
-    @classmethod
-    def of(
-        cls, u: fem.Function, degree: int | None, selective: bool, inside: dict[str, Any]
-    ) -> Quadrature:
-        """Return that of a displacement; the default degree is exact on affine cells.
-
-        Raise an InputError where selective integration does not fit the displacement.
-        """
-        V = u.function_space
-        own, cell = V.element.basix_element.degree, V.mesh.basix_cell()
-        simplex = cell in (basix.CellType.triangle, basix.CellType.tetrahedron)
-        if checked_flag(selective, "selective") and (simplex or own != 1):
-            raise InputError(
-                f"selective=True on {cell.name}s with displacements of degree {own}; expected "
-                "quadrilaterals or hexahedra of degree 1 (degree 2 does not lock)"
-            )
-        if degree is None:
-            degree = max(2 * own - (2 if simplex else 0), 1)
-        return cls(V.mesh, degree, selective, inside)
-
-    @property
-    def dx(self) -> ufl.Measure:
-        """The measure of cells."""
-        data = {"quadrature_degree": self.degree, "quadrature_scheme": "default"}
-        return ufl.Measure("dx", domain=self.mesh, metadata=data, **self.inside)
-
-    @property
-    def dx_volume(self) -> ufl.Measure:
-        """The measure of what resists a change of volume."""
-        if not self.selective:
-            return self.dx
-        dim = self.mesh.topology.dim
-        points = tuple((0.5 + shift,) * dim for shift in (-self.beside, self.beside))
-        rule = {"quadrature_rule": "custom", "quadrature_points": points}
-        rule |= {"quadrature_weights": (0.5, 0.5)}
-        return ufl.Measure("dx", domain=self.mesh, metadata=rule, **self.inside)
-
-    def space(self, shape: tuple[int, ...] = ()) -> fem.FunctionSpace:
-        """Return the space of values at the points."""
-        cell = self.mesh.basix_cell()
-        element = basix.ufl.quadrature_element(cell, value_shape=shape, degree=self.degree)
-        return fem.functionspace(self.mesh, element)
-
-
 class Material(ABC):
     """A ready law, of all volumes or of some. Creation is collective.
 
@@ -177,6 +120,11 @@ class Material(ABC):
         state: Internal variables with their values at the end of a load step.
     """
 
+    # how far from the centre, of a reference cell of length 1, the two points of the rule there
+    # are: FFCx 0.9 takes values at a single point for those of other rules, too, and values that
+    # differ by 1e-6 for the same; forces of a homogeneous strain are off by the square
+    _beside = 1e-5
+
     def __init__(
         self,
         elasticity: Elasticity,
@@ -185,8 +133,17 @@ class Material(ABC):
         selective: bool,
         volumes: Volumes,
     ) -> None:
-        check_law(elasticity, u, name := type(self).__name__)
-        self.elasticity, self.u, on = elasticity, u, elasticity.on
+        name = type(self).__name__
+        checked_type(elasticity, Elasticity, "elasticity", "a tfeti_dolfinx.Elasticity")
+        checked_type(u, fem.Function, "u", "a dolfinx.fem.Function")
+        if elasticity.model == "plane_stress":
+            raise InputError(
+                f"{name}: plane stress is not there; expected plane strain, axisymmetric or 3d"
+            )
+        mesh, on = elasticity.mesh, elasticity.on
+        if u.function_space.mesh is not mesh:
+            raise InputError(f"{name}: u is on another mesh than the elasticity")
+        self.elasticity, self.u = elasticity, u
         self.volumes: list[int] | None = None
         self.state: Mapping[fem.Function, NewValue] = {}
         self._inside: fem.Function | None = None
@@ -201,17 +158,33 @@ class Material(ABC):
             inside = {"subdomain_data": on.cell_tags, "subdomain_id": tuple(self.volumes)}
             self._inside = fem.Function(fem.functionspace(on.mesh, ("DG", 0)))
             self._inside.x.array[self._rows_of(self._inside)] = 1.0
-        self._at = Quadrature.of(u, degree, selective, inside)
-        self.dx = self._at.dx
-        # where it is selective: what resists a change of volume at the centre of each cell
+        own, cell = u.function_space.element.basix_element.degree, mesh.basix_cell()
+        simplex = cell in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        self._selective = checked_flag(selective, "selective")
+        if selective and (simplex or own != 1):
+            raise InputError(
+                f"selective=True on {cell.name}s with displacements of degree {own}; expected "
+                "quadrilaterals or hexahedra of degree 1 (degree 2 does not lock)"
+            )
+        exact = max(2 * own - (2 if simplex else 0), 1)  # on affine cells
+        self._degree = exact if degree is None else degree
+        rule: dict[str, Any] = {"quadrature_degree": self._degree, "quadrature_scheme": "default"}
+        self.dx = ufl.Measure("dx", domain=mesh, metadata=rule, **inside)
+        if selective:
+            shifts = (-self._beside, self._beside)
+            points = tuple((0.5 + shift,) * mesh.topology.dim for shift in shifts)
+            rule = {"quadrature_rule": "custom", "quadrature_points": points}
+            rule |= {"quadrature_weights": (0.5, 0.5)}
+        # of what resists a change of volume; where it is selective, at the centre of each cell
+        self._dx_volume = ufl.Measure("dx", domain=mesh, metadata=rule, **inside)
         self._centred: tuple[fem.Function, fem.Expression] | None = None
 
     def update(self) -> None:
         """Take ``u`` as it is now. Collective."""
-        if not self._at.selective:
+        if not self._selective:
             return
         if self._centred is None:
-            W = fem.functionspace(self._at.mesh, ("DG", 0, (3, 3)))
+            W = fem.functionspace(self.elasticity.mesh, ("DG", 0, (3, 3)))
             of_u = fem.Expression(self._stresses(self.u)[0], interpolation_points(W))
             self._centred = fem.Function(W), of_u
         function, of_u = self._centred
@@ -222,7 +195,8 @@ class Material(ABC):
         of_volume, of_shape = self._stresses(u)
         if self._centred is not None:
             of_volume = self._centred[0]
-        return self._in_volumes(of_volume + of_shape)
+        whole = of_volume + of_shape
+        return whole if self._inside is None else self._inside * whole  # 0 outside of the volumes
 
     @abstractmethod
     def _stresses(self, u: Any) -> tuple[Any, Any]:
@@ -234,6 +208,13 @@ class Material(ABC):
         function.law = self
         return function
 
+    def _space(self, shape: tuple[int, ...] = ()) -> fem.FunctionSpace:
+        """Return the space of values at the quadrature points."""
+        mesh = self.elasticity.mesh
+        cell = mesh.basix_cell()
+        element = basix.ufl.quadrature_element(cell, value_shape=shape, degree=self._degree)
+        return fem.functionspace(mesh, element)
+
     def _rows_of(self, function: fem.Function) -> Any:
         """Return which values of a scalar function belong to cells of the law, cell by cell."""
         if self.volumes is None:
@@ -241,10 +222,6 @@ class Material(ABC):
         tags = self.elasticity.on.cell_tags
         cells = tags.indices[np.isin(tags.values, self.volumes)]
         return np.asarray(function.function_space.dofmap.list)[cells].ravel()
-
-    def _in_volumes(self, stress: Any) -> Any:
-        """Return a stress that is 0 outside of the volumes."""
-        return stress if self._inside is None else self._inside * stress
 
 
 def laws_of(
@@ -319,7 +296,7 @@ class Plasticity(Material):
             name: in_ufl(value, elasticity.on, name, expected) for (name, expected), value in values
         }
         self._tolerances = tolerances or ReturnTolerances()
-        scalar = self._at.space()
+        scalar = self._space()
         self._value, points = fem.Function(scalar), interpolation_points(scalar)
         self._rows = self._rows_of(self._value)
         self._at_points = {
@@ -340,13 +317,15 @@ class Plasticity(Material):
         """
         values = {}
         for name, value in self._at_points.items():
-            if isinstance(value, fem.Constant):
-                values[name] = np.asarray(value.value)
-            else:
-                self._value.interpolate(value)
-                values[name] = np.array(self._value.x.array[self._rows])
+            is_number = isinstance(value, fem.Constant)
+            values[name] = np.asarray(value.value) if is_number else self._values_of(value)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
             return IsotropicHardening(**values, tolerances=self._tolerances)
+
+    def _values_of(self, scalar: fem.Expression) -> Array:
+        """Return the values of an expression at its quadrature points. Collective."""
+        self._value.interpolate(scalar)
+        return np.array(self._value.x.array[self._rows])
 
     @property
     def regularisation(self) -> Any:
@@ -394,12 +373,12 @@ class J2Plasticity(Plasticity):
 
     def _begin(self) -> None:
         self._gdim, elasticity, u = self.elasticity.mesh.geometry.dim, self.elasticity, self.u
-        Q, W = self._at.space(), self._at.space((6 if self._gdim == 3 else 4,))
+        Q, W = self._space(), self._space((6 if self._gdim == 3 else 4,))
         self.plastic_strain = fem.Function(W, name="plastic_strain")
         self.p = fem.Function(Q, name="accumulated_plastic_strain")
         self._dp = self._updated(Q, name="plastic_increment")  # of this load step
         self._slope = self._updated(Q, name="hardening_slope")
-        self._q_and_G, s = fem.Function(self._at.space((2,))), self._trial(u)
+        self._q_and_G, s = fem.Function(self._space((2,))), self._trial(u)
         q_and_G = ufl.as_vector((ufl.sqrt(1.5 * ufl.inner(s, s)), elasticity.mu))
         self._q_and_G_of_u = fem.Expression(q_and_G, interpolation_points(Q))
         self._n = 1.5 * s / self._norm(u)  # direction of plastic flow
@@ -427,8 +406,10 @@ class J2Plasticity(Plasticity):
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫σ(u):ε(v)."""
-        e = self.elasticity.strain(v)
-        return self._integrated(ufl.tr(self.elasticity.strain(self.u)), self._deviator(self.u), e)
+        thickness, e = self.elasticity.thickness, self.elasticity.strain(v)
+        dilatation = ufl.tr(self.elasticity.strain(self.u))
+        volume = thickness * self._bulk * dilatation * ufl.tr(e)
+        return volume * self._dx_volume + thickness * ufl.inner(self._deviator(self.u), e) * self.dx
 
     def tangent(self, w: Any, v: Any) -> ufl.Form:
         """Return the derivative of ``residual`` along w, consistent with the return."""
@@ -467,12 +448,6 @@ class J2Plasticity(Plasticity):
             return ufl.as_matrix([[c[0], c[3], c[4]], [c[3], c[1], c[5]], [c[4], c[5], c[2]]])
         return ufl.as_matrix([[c[0], c[3], 0], [c[3], c[1], 0], [0, 0, c[2]]])
 
-    def _integrated(self, dilatation: Any, deviator: Any, strain: Any) -> ufl.Form:
-        """Integral of a stress, given in parts, times a strain."""
-        volume = self.elasticity.thickness * self._bulk * dilatation * ufl.tr(strain)
-        shape = self.elasticity.thickness * ufl.inner(deviator, strain)
-        return volume * self._at.dx_volume + shape * self.dx
-
 
 def derivative_of(F: ufl.Form, u: fem.Function, laws: Sequence[Material]) -> ufl.Form:
     """Return the derivative of a residual as ``update`` of its laws returns stresses."""
@@ -480,15 +455,3 @@ def derivative_of(F: ufl.Form, u: fem.Function, laws: Sequence[Material]) -> ufl
     v, w = J.arguments()
     of_laws = [law.of_update(F, w, v) for law in laws if isinstance(law, J2Plasticity)]
     return sum(of_laws, J)
-
-
-def check_law(elasticity: Any, u: Any, name: str) -> None:
-    """Raise unless a law fits a displacement."""
-    checked_type(elasticity, Elasticity, "elasticity", "a tfeti_dolfinx.Elasticity")
-    checked_type(u, fem.Function, "u", "a dolfinx.fem.Function")
-    if elasticity.model == "plane_stress":
-        raise InputError(
-            f"{name}: plane stress is not there; expected plane strain, axisymmetric or 3d"
-        )
-    if u.function_space.mesh is not elasticity.mesh:
-        raise InputError(f"{name}: u is on another mesh than the elasticity")

@@ -12,7 +12,6 @@ from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sum_rows, sums
 from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
-from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
 from tfeti_dolfinx.errors import (
     ConvergenceError,
@@ -28,9 +27,7 @@ from tfeti_dolfinx.nonlinear.materials import derivative_of, laws_of
 from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonTolerances
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
-from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.system import System
 
@@ -157,7 +154,7 @@ class NonlinearContactProblem(ContactProblem):
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
-        self._exact, self._atol = self.options.number, self.options.atol
+        self._exact = self.options.number
         self._system.follows = True
         self._begin = self._first
         self._system.begin_at(self.dofs.to_primal(self._begin))
@@ -168,7 +165,6 @@ class NonlinearContactProblem(ContactProblem):
         self._keeping = ModelKeeping(self._tolerances, finite)
         self._last_increment = self._loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
-        self._diagnostics.finite = self._finite
         if finite:
             self._check_rotations()
 
@@ -188,8 +184,7 @@ class NonlinearContactProblem(ContactProblem):
             self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:
-            warns = self._settings.options.warnings
-            self.options = replace(self.options, rtol=self._exact, atol=self._atol, warnings=warns)
+            self.options = self._settings.options
 
     def _newton(self) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
@@ -365,11 +360,10 @@ class NonlinearContactProblem(ContactProblem):
         A kept model without an answer, as its places may hold no body that turns, is made anew.
         """
         u, again = np.array(self.u.x.array), False
-        warns &= self._settings.options.warnings
-        atol = max(self._atol, self._last_digit)
-        self.options = replace(self.options, rtol=rtol, atol=atol, warnings=warns)
-        if self._places is not None:
-            self._go_to_places(self._places)
+        given = self._settings.options
+        atol, warns = max(given.atol, self._last_digit), warns and given.warnings
+        self.options = replace(given, rtol=rtol, atol=atol, warnings=warns)
+        self._go_to_places()
         try:
             self._system.look_for_changes()
             self._solve_in_rounds()
@@ -386,11 +380,13 @@ class NonlinearContactProblem(ContactProblem):
             self._set(u)
             self._solve_linearised(rtol, warns)
 
-    def _go_to_places(self, places: CurrentPlaces) -> None:
-        """Let contact and rigid motions be those of X + u. Collective."""
-        places.move(anew=not self._system.forms.kept)
+    def _go_to_places(self) -> None:
+        """Let contact and rigid motions be those of X + u, in finite strain. Collective."""
+        if self._places is None:
+            return
+        self._places.move(anew=not self._system.forms.kept)
         if not self._system.forms.kept:
-            moved = (self.u.x.array, places.moved)
+            moved = (self.u.x.array, self._places.moved)
             self._system.origin = np.stack([self.dofs.to_primal(u) for u in moved])
         self._system.begin_at(self.dofs.to_primal(self._begin))
 
@@ -492,9 +488,9 @@ class NonlinearContactProblem(ContactProblem):
         Raises:
             InputError: As ``ContactProblem.accept``.
         """
-        before, _ = self._accepted
+        before = self._accepted
         super().accept()
-        if self._accepted[0] is not before:
+        if self._accepted is not before:
             self._state.commit()
             self._begin = np.array(self.u.x.array)
             self._set(self._begin)
@@ -543,18 +539,12 @@ class NonlinearContactProblem(ContactProblem):
         self._begin, self._system.weights = self.dofs.to_dolfinx(state.u), state.weights
         self._system.forms.kept, self._keeping.freezes = False, bool(state.freezes)
         self._set(self._begin)
-        if self._places is not None:
-            self._go_to_places(self._places)
+        self._go_to_places()
 
     def _negligible(self, subdomains: Subdomains) -> Array:
         begin = subdomains.with_rigid(self.dofs.to_primal(self._begin))
         share = self._tolerances.negligible * self._exact
         return np.asarray(share * subdomains.body_sizes([begin])[0])
-
-    def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
-        solution = super()._make_solution(u, lam, face, gluing)
-        solution.finite = self._finite
-        return solution
 
     def _return(self) -> None:
         super()._return()

@@ -35,14 +35,14 @@ class InternalVariables:
 
     def __init__(self, given: Mapping[fem.Function, NewValue], mesh: Any) -> None:
         self._comm: MPI.Intracomm = mesh.comm
-        self._new: list[tuple[fem.Function, Callable[[], Array]]] = []
+        self._new: dict[fem.Function, Callable[[], Array]] = {}
         for function, value in given.items():
             checked_type(function, fem.Function, "state: a key", "a dolfinx.fem.Function")
             name = f"state: the new value of {function.name}"
             if function.function_space.mesh is not mesh:
                 raise InputError(f"state: {function.name} is on another mesh than the torn one")
             if callable(value) and not isinstance(value, ufl.core.expr.Expr):
-                self._new.append((function, value))
+                self._new[function] = value
                 continue
             if getattr(value, "ufl_shape", None) != function.ufl_shape:
                 raise InputError(
@@ -52,7 +52,7 @@ class InternalVariables:
             V = function.function_space
             with raised_on_all_ranks(self._comm), named(f"{name} cannot be compiled"):
                 expression = fem.Expression(value, interpolation_points(V))
-            self._new.append((function, partial(_interpolated, expression, fem.Function(V))))
+            self._new[function] = partial(_interpolated, expression, fem.Function(V))
         self.functions = list(given)
 
     def in_cells(self) -> Array:
@@ -75,7 +75,7 @@ class InternalVariables:
         """
         found = []
         with raised_on_all_ranks(self._comm):
-            for function, value in self._new:
+            for function, value in self._new.items():
                 with named(f"state: the new value of {function.name}"):
                     new = np.asarray(value(), dtype=float)
                 if new.shape != function.x.array.shape or not np.all(np.isfinite(new)):

@@ -20,7 +20,7 @@ from tfeti_dolfinx.common.files import PARTIAL, written_whole
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table
+from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table, numbered
 
 INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 6
 KIND = "checkpoint of tfeti_dolfinx"
@@ -180,9 +180,8 @@ class Checkpoint:
             if checksums is not None:  # on rank 0
                 states, of_fields, parts = (list(c) for c in zip(*checksums, strict=True))
                 before = self._index
-                line: dict[str, list[Any]] = {"fields": [], "subdomains": []}
-                if fields:
-                    line = {"fields": of_fields, "subdomains": parts}
+                owned = {"fields": of_fields, "subdomains": parts}
+                line = owned if fields else {key: [] for key in owned}
                 with (self.path / RECORDS).open("ab") as file:
                     file.write(_sealed({**record, **line}))
                     _settle(file)
@@ -248,23 +247,18 @@ class Checkpoint:
                         raise damaged(file, where)
                     with np.load(file) as contents:
                         found[rank] = dict(contents)
-        places = [(rank_of[s], subdomains[rank_of[s]].index(s)) for s in self._subdomains]
         table: Table = {}
         first = next(iter(found.values()))
         for name in (name for name in first if not name.endswith(COUNTS)):
             table[name] = first[name], None
-            if any(name + COUNTS not in arrays for arrays in found.values()):
-                continue
-            # rows by subdomains, each at a place in a file, and their labels
-            pieces = {
-                rank: np.split(arrays[name], np.cumsum(arrays[name + COUNTS])[:-1])
-                for rank, arrays in found.items()
-            }
-            rows = [pieces[rank][place] for rank, place in places]
-            labels = [np.zeros(0, dtype=np.int64)]
-            for s, part in zip(self._subdomains, rows, strict=True):
-                labels.append((s << SHIFT) + np.arange(len(part)))
-            table[name] = np.concatenate([first[name][:0], *rows]), np.concatenate(labels)
+            if all(name + COUNTS in arrays for arrays in found.values()):
+                known = np.array([s for rank in found for s in subdomains[rank]], dtype=np.int64)
+                counts = np.concatenate([arrays[name + COUNTS] for arrays in found.values()])
+                rows = np.concatenate([arrays[name] for arrays in found.values()])
+                labels = numbered(np.repeat(known, counts))
+                order = np.argsort(labels)
+                order = order[np.isin(labels[order] >> SHIFT, self._subdomains)]
+                table[name] = rows[order], labels[order]
         return table
 
     def _commit(self, index: Index) -> None:

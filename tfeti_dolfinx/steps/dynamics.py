@@ -135,57 +135,48 @@ class Predictor:
         w is in DOLFINx's order, as is this rank's mass M, whose factors are kept while it is the
         same object; right sides of the rows are as before afterwards.
         """
-        dofs, constraints = self._dofs, gluing.constraints
-        before, primal = np.array(constraints.c), dofs.to_primal(w)
-        values = mean_of_copies(dofs, primal).ravel()
+        dofs, settings, constraints = self._dofs, self._settings, gluing.constraints
+        before, f = np.array(constraints.c), M @ w
+        values = mean_of_copies(dofs, dofs.to_primal(w)).ravel()
         constraints.c[constraints.sets.equalities] = gluing.to_equalities @ values
         try:
-            self._make(M, M @ w, gluing)
-            return dofs.to_dolfinx(self._solve(gluing))
+            # 1. what is out of date
+            if M is not self._M:
+                self.destroy()
+                data = subdomain_data(dofs, M, f, constraints.trace)
+                equals = EqualSubdomains(settings.inverses())
+                self._subdomains, self._M = settings.make_subdomains(data, dofs, equals), M
+            assert self._subdomains is not None
+            self._subdomains.update(f=dofs.to_primal(f))
+            if self._dual is not None and self._dual.constraints is constraints:
+                self._dual.update_load()
+            else:
+                if self._dual is not None:
+                    self._dual.destroy()
+                    self._subdomains.retrace(constraints.trace)
+                self._dual, self._options = settings.make_dual(
+                    constraints,
+                    self._subdomains,
+                    dofs,
+                    # without friction
+                    lambda rows: contact_set(replace(rows, limits=0.0 * rows.limits)),
+                )
+            # 2. the program, from the last multipliers on
+            dual, options, start = self._dual, self._options, None
+            dual.begin_solve()
+            if self.rows_and_start is not None:  # nothing has a kernel in M
+                start = (gluing.multipliers(*self.rows_and_start), np.zeros(0))
+                if self.rows_and_start[0] is gluing:
+                    dual.know(self.rows_and_start[1], self.image)
+            self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
+            result, accuracy = solve_dual(dual, options, options.qp_type, start)
+            self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
+            self.last = result.lam.copy(), result.face
+            self.multiplications = dual.F.count
+            conclude(result, accuracy, options, dofs.comm)
+            return dofs.to_dolfinx(accuracy.u)
         finally:
             constraints.c[:] = before
-
-    def _make(self, M: csr_array, f: Array, gluing: Gluing) -> None:
-        """Make what is out of date."""
-        constraints, settings, dofs = gluing.constraints, self._settings, self._dofs
-        new_rows = self._dual is None or self._dual.constraints is not constraints
-        if M is not self._M:
-            self.destroy()
-            data = subdomain_data(dofs, dofs.decomposition, M, f, constraints.trace)
-            equals = EqualSubdomains(settings.inverses())
-            self._subdomains = settings.make_subdomains(data, dofs, equals)
-            self._M, new_rows = M, True
-        assert self._subdomains is not None
-        self._subdomains.update(f=dofs.to_primal(f))
-        if not new_rows and self._dual is not None:
-            self._dual.update_load()
-            return
-        if self._dual is not None:
-            self._dual.destroy()
-            self._subdomains.retrace(constraints.trace)
-        self._dual, self._options = settings.make_dual(
-            constraints,
-            self._subdomains,
-            dofs,
-            lambda rows: contact_set(replace(rows, limits=0.0 * rows.limits)),  # no friction
-        )
-
-    def _solve(self, gluing: Gluing) -> Array:
-        """Return the displacement in primal order."""
-        dual, options, start = self._dual, self._options, None
-        assert dual is not None
-        dual.begin_solve()
-        if self.rows_and_start is not None:  # nothing has a kernel in M
-            start = (gluing.multipliers(*self.rows_and_start), np.zeros(0))
-            if self.rows_and_start[0] is gluing:
-                dual.know(self.rows_and_start[1], self.image)
-        self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
-        result, accuracy = solve_dual(dual, options, options.qp_type, start)
-        self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
-        self.last = result.lam.copy(), result.face
-        self.multiplications = dual.F.count
-        conclude(result, accuracy, options, self._dofs.comm)
-        return accuracy.u
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; the next call makes them anew."""
@@ -279,9 +270,7 @@ class ContactDynamics(ContactProblem):
         tools = self._system.tools
         tools.read(self.time)
         tools.begin = [tools.pose(i) for i in range(len(tools))]
-        self._predictor: Predictor | None = None
-        if self._stabilised:
-            self._predictor = Predictor(self.dofs, self._settings)
+        self._predictor = Predictor(self.dofs, self._settings) if stabilised else None
 
     def _given_besides(self) -> dict[str, Any]:
         flags = {"stabilised": self._stabilised, "lumped": self._lumped}
@@ -336,12 +325,11 @@ class ContactDynamics(ContactProblem):
         Raises:
             InputError: As ``ContactProblem.accept``.
         """
-        before, _ = self._accepted
+        before = self._accepted
         super().accept()
-        if self.solution is before:
-            return
-        assert self.solution.v is not None
-        self._system.forms.inertia.move(np.array(self.u.x.array), self.solution.v)
+        if self._accepted is not before:
+            assert self.solution.v is not None
+            self._system.forms.inertia.move(np.array(self.u.x.array), self.solution.v)
 
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
@@ -471,7 +459,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         last = np.array(self.u.x.array)
         if self._places is not None:  # the prediction is that of the begin of the step
             self._set(self._begin)
-            self._go_to_places(self._places)
+            self._go_to_places()
         try:
             self._system.look_for_changes()
             self._set_out()

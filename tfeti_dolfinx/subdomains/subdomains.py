@@ -338,15 +338,13 @@ class SubdomainMethod(Protocol):
         """Return stiffness and load of the subdomains. Collective."""
 
 
-def subdomain_data(
-    dofs: TornDofs, decomposition: Decomposition, K: Any, f: Array, trace: Array
-) -> Iterator[SubdomainData]:
+def subdomain_data(dofs: TornDofs, K: Any, f: Array, trace: Array) -> Iterator[SubdomainData]:
     """Return the data of each subdomain's Block on this rank, made one at a time. Collective.
 
     K, scipy CSR, and f are this rank's, in DOLFINx's numbering; ``trace`` are the local primal
     unknowns that rows of B touch, ascending.
     """
-    gdim = decomposition.mesh.geometry.dim
+    decomposition, gdim = dofs.decomposition, dofs.decomposition.mesh.geometry.dim
     x = dofs.points()[:, :gdim]
     shares = 1.0 / dofs.spread(dofs.multiplicity)
     # centre and size of each body, the same on all ranks and for all subdomains
