@@ -105,7 +105,8 @@ class Elasticity:
             nu, on, "nu", POISSON_OF_SHEETS if self.model == "plane_stress" else POISSON
         )
         self.mu = self.E / 2 / (1 + self.nu)
-        self._last: tuple[Any, Any] = self, None  # a displacement and its stress: solves repeat
+        self._made_of: tuple[Any, ...] = (None,) * 4  # that of the last displacement is kept
+        self._stress: Any = None
         self.thickness: Any = 1.0
         if self.model == "axisymmetric":
             r, comm = self.mesh.geometry.x[:, 0], self.mesh.comm
@@ -155,23 +156,24 @@ class Elasticity:
         Raises:
             InputError: As ``strain``.
         """
-        if self._last[0] is u:
-            return self._last[1]
-        e, E, nu, mu = self.strain(u), self.E, self.nu, self.mu
-        lmbda = E * nu / (1 + nu) / (1 - 2 * nu)
-        sigma = 2 * mu * e + lmbda * ufl.tr(e) * ufl.Identity(3)
-        if self.model == "plane_stress":
-            # λ such that σ_zz = 0 is an exact zero, which UFL drops
-            pressure = E * nu / (1 - nu**2) * (e[0, 0] + e[1, 1])
-            sigma = ufl.as_tensor(
-                [
-                    [2 * mu * e[0, 0] + pressure, 2 * mu * e[0, 1], 0],
-                    [2 * mu * e[1, 0], 2 * mu * e[1, 1] + pressure, 0],
-                    [0, 0, 0],
-                ]
-            )
-        self._last = u, sigma
-        return sigma
+        made_of = (u, self.E, self.nu, self.mu)
+        if not all(a is b for a, b in zip(made_of, self._made_of, strict=True)):
+            e, E, nu, mu = self.strain(u), self.E, self.nu, self.mu
+            lmbda = E * nu / (1 + nu) / (1 - 2 * nu)
+            sigma = 2 * mu * e + lmbda * ufl.tr(e) * ufl.Identity(3)
+            if self.model == "plane_stress":
+                # λ such that σ_zz = 0 is an exact zero, which UFL drops
+                lmbda = E * nu / (1 - nu**2)
+                pressure = lmbda * (e[0, 0] + e[1, 1])
+                sigma = ufl.as_tensor(
+                    [
+                        [2 * mu * e[0, 0] + pressure, 2 * mu * e[0, 1], 0],
+                        [2 * mu * e[1, 0], 2 * mu * e[1, 1] + pressure, 0],
+                        [0, 0, 0],
+                    ]
+                )
+            self._made_of, self._stress = made_of, sigma
+        return self._stress
 
     def a(self, u: Any, v: Any, dx: ufl.Measure | None = None) -> ufl.Form:
         """The bilinear form ∫σ(u):ε(v) over the volume: times ``thickness``, 2πr if axisymmetric.
