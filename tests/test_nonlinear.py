@@ -20,8 +20,7 @@ DX = {"metadata": {"quadrature_degree": 4}}
 def torn(comm, gdim, n, bulge, subdomains):
     """The block of ``reference.nonlinear``, torn."""
     mesh, tags = block(gdim, n, bulge, comm)
-    surfaces = {"low": 1, "top": 2}
-    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=surfaces)
+    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces={"low": 1, "top": 2})
 
 
 def plane(gdim):
@@ -121,13 +120,11 @@ def test_without_contact_it_is_dolfinx_own_solver(finite, comm):
     internal, steps = InternalVariables(state, mesh), []
     solve = by_dolfinx(F, w, conditions(W, tags.find(1), tags.find(2), way))
     decomposition = torn(comm, 2, 4, 0.2, 4)
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-    u, value = fem.Function(V), fem.Constant(decomposition.mesh, (0.0, 0.0))
-    F, state = make(u, ufl.TestFunction(V))
+    V, u, v, _ = unknowns(decomposition)
+    value, (F, state) = fem.Constant(decomposition.mesh, (0.0, 0.0)), make(u, v)
     bcs = conditions(V, decomposition.facets("low"), decomposition.facets("top"), value)
-    problem = tfeti.NonlinearContactProblem(
-        F, u, bcs, [], decomposition, state=state, finite=finite, petsc_options={"rtol": 1e-10}
-    )
+    more = {"state": state, "finite": finite, "petsc_options": {"rtol": 1e-10}}
+    problem = tfeti.NonlinearContactProblem(F, u, bcs, [], decomposition, **more)
     for way.value[1] in path:
         solve()
         steps.append(np.array(w.x.array.reshape(-1, 2)))
@@ -294,8 +291,7 @@ def two_blocks(degree, **where):
     V, u, v, _ = unknowns(decomposition, degree)
     F = ufl.derivative(neo_hooke(u, E, 0.0) * ufl.dx(**DX), u, v)
     value = fem.Constant(decomposition.mesh, 0.0)
-    sides = ("lower bottom", "lower left", "upper left")
-    bcs = held(decomposition, ("upper top", value), *sides)(V)
+    bcs = held(decomposition, ("upper top", value), "lower bottom", "lower left", "upper left")(V)
     return decomposition, u, F, value, bcs
 
 
@@ -306,8 +302,7 @@ def finite(comm, gdim=2, n=4, bulge=0.2, rtol=1e-9):
     value, bc = held_top(V, decomposition)
     F, _ = of_neo_hooke(u, v)
     options = {"finite": True, "petsc_options": {"rtol": rtol}}
-    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(gdim)], decomposition, **options)
-    return problem, value
+    return tfeti.NonlinearContactProblem(F, u, [bc], [plane(gdim)], decomposition, **options), value
 
 
 def test_a_closed_elastic_cycle_ends_where_it_began(comm):
@@ -384,8 +379,7 @@ def test_what_updates_may_have_a_function_of_its_own_named_u(comm):
     decomposition, u, v, elastic, _, bc = small(comm)
 
     class Heated:
-        def __init__(self):
-            self.u = fem.Function(u.function_space)
+        u = fem.Function(v.ufl_function_space())
 
         def update(self):
             self.u.x.array[:] = 0.0

@@ -189,6 +189,7 @@ class NonlinearContactProblem(ContactProblem):
         except TfetiError:  # on all ranks
             self._system.forms.kept = False
             self._set(begin)
+            self._system.tools.go_back()
             self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:
