@@ -7,7 +7,7 @@ from bodies import held, torn_boxes
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import accepted, clamp, integral, solved, unknowns
+from scenes import accepted, clamp, integral, largest, solved, unknowns
 from scipy.optimize import brentq
 
 import tfeti_dolfinx as tfeti
@@ -285,6 +285,7 @@ def test_stresses_at_nodes_are_those_of_the_points(cell, comm):
     expected = q - 3.0 * mu * (q - 0.01) / (3.0 * mu + 0.1)
     for found in (problem.solution.von_mises, problem.solution.nodal_von_mises):
         assert np.allclose(found.x.array, expected, rtol=1e-7, atol=0.0)
+    assert largest(problem.solution.discretisation_error.x.array) < 1e-8
 
 
 def test_mistakes_are_named():

@@ -221,9 +221,12 @@ class ContactProblem:
         """
         self._meet("solve")
         self._counts, self._outcome = SolverCounts(), Outcome()
+        rows = self._system.rows()
         try:
             self._find()
         except TfetiError as error:  # on all ranks
+            if self._counts.late_contact_rows:  # of a place where bodies are not
+                self._system.know_rows(rows)
             if isinstance(error, NoSolutionError):
                 self._outcome = replace(self._outcome, converged_reason="NO_SOLUTION")
             self._compose_report()
@@ -532,7 +535,7 @@ class ContactProblem:
         system.tools.go_back(state.tools)
         self._take_motion(state)
         sides = list(map(int, state.secondary))
-        system.know_rows(list(state.reach), state.groups(self.dofs), sides)
+        system.know_rows((list(state.reach), state.groups(self.dofs)), sides)
         system.look_for_changes()
         system.tools.go_back(state.tools)  # by now laws may have others
         dual = system.make(self._seconds)

@@ -10,6 +10,7 @@ import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -68,7 +69,7 @@ def labels_of_rows(gluing: Gluing, of_groups: Array) -> dict[str, Array]:
     """Return labels of ``rows`` and ``conditions``, from those of the nodes of owned groups.
 
     Rows of a node: equalities as they stand, of each contact that along the normal, and those along
-    the tangents.
+    the tangents. Those of springs come last in a subdomain: stiffnesses say whether there are any.
     """
     dofs, sets, records = gluing.dofs, gluing.constraints.sets, gluing.records
     copies = dofs.multiplicity[:, None]
@@ -83,8 +84,7 @@ def labels_of_rows(gluing: Gluing, of_groups: Array) -> dict[str, Array]:
     group[sets.tangents] = of_groups[records.group[tangent]][:, None]
     kind[sets.tangents] = 2 * records.contact[tangent][:, None] + 1
     place[sets.tangents] = np.arange(sets.tangents.shape[1])
-    group[sets.springs] = dofs.subdomains[sets.springs_of].astype(np.int64) << SHIFT
-    kind[sets.springs] = -2
+    group[sets.springs] = (dofs.subdomains[sets.springs_of].astype(np.int64) + 1 << SHIFT) - 1
     place[sets.springs] = np.arange(len(sets.springs))
     rows = numbered(group >> SHIFT, group, kind, place)
     group = of_groups[records.group]
@@ -108,9 +108,10 @@ def rows_of(values: Array, labels: Array) -> Array:
 
 
 def arranged(values: Array, kept: Array, here: Array) -> Array:
-    """Return rows with labels in the order of other ones, which are the same labels."""
-    out = np.empty_like(values)
-    out[np.argsort(here)] = values[np.argsort(kept)]
+    """Return rows with labels in the order of other ones; what these have alone is 0."""
+    out = np.zeros((len(here), *values.shape[1:]), dtype=values.dtype)
+    _, to, of = np.intersect1d(here, kept, assume_unique=True, return_indices=True)
+    out[to] = values[of]
     return out
 
 
@@ -123,7 +124,7 @@ OF = {
     **dict.fromkeys(("predicted", "image", "predicted_image"), "rows"),
     **dict.fromkeys(("slip", "contact", "group", "reached"), "conditions"),
     "internal": "cells",
-    "layout": "subdomains",
+    **dict.fromkeys(("layout", "springs"), "subdomains"),
 }
 KINDS = ("subdomains", "nodes", "cells", "rows", "conditions")
 
@@ -134,6 +135,7 @@ class SavedState:
 
     subdomains: Array  # labels of this rank's subdomains
     layout: Array  # checksums of their cells and points in the mesh before it was torn
+    springs: Array  # how many of their rows are of springs
     nodes: Array  # labels of primal nodes
     rows: Array  # labels of rows
     conditions: Array  # labels of conditions
@@ -182,6 +184,7 @@ class SavedState:
         return cls(
             subdomains=solution.decomposition.subdomains.astype(np.int64) << SHIFT,
             layout=layout_of(solution.decomposition),
+            springs=springs_of(gluing),
             nodes=nodes,
             **labels_of_rows(gluing, of_groups),
             u=solution.u,
@@ -234,9 +237,15 @@ class SavedState:
         """Return the state with rows and conditions in the order of a problem's. Collective."""
         of_groups = labels_of_groups(gluing.dofs, self.nodes)
         here, records = labels_of_rows(gluing, of_groups), gluing.records
-        with raised_on_all_ranks(gluing.dofs.comm):
-            same = all(same_labels(getattr(self, kind), here[kind]) for kind in here)
+        springs, comm = springs_of(gluing), gluing.dofs.comm
+        others = any_rank(comm, not np.array_equal(springs, self.springs))
+        with raised_on_all_ranks(comm):
+            kept, rows = self._held(self.rows, self.springs), self._held(here["rows"], springs)
+            same = same_labels(kept, rows) and same_labels(self.conditions, here["conditions"])
             state = self._in_order(here) if same else self
+            if others:  # of another stiffness: what of F and its kernel is known, too
+                none = np.zeros(0)
+                state = replace(state, mu=none, image=none, directions=np.zeros((0, 2, 0)))
             found = (state.contact, state.group, state.reached)
             expected = (records.contact, of_groups[records.group], records.within_reach)
             if not same or not all(map(np.array_equal, found, expected)):
@@ -245,6 +254,12 @@ class SavedState:
                     "contacts, conditions and data that it was found with"
                 )
         return state
+
+    def _held(self, rows: Array, springs: Array) -> Array:
+        """Return labels of rows but for those of springs, of which subdomains have so many."""
+        subdomain = np.searchsorted(self.subdomains, rows, side="right") - 1
+        count = np.bincount(subdomain, minlength=len(springs)) - springs
+        return rows[rows - self.subdomains[subdomain] < count[subdomain]]
 
     def _in_order(self, here: dict[str, Array]) -> SavedState:
         """Return the state with rows of these kinds in the order of these labels."""
@@ -274,6 +289,12 @@ class SavedState:
             "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
             "number of directions": self.directions.shape[2],
         }
+
+
+def springs_of(gluing: Gluing) -> Array:
+    """Return how many rows of springs each subdomain of this rank has."""
+    count = len(gluing.dofs.decomposition.subdomains)
+    return np.bincount(gluing.constraints.sets.springs_of, minlength=count)
 
 
 def layout_of(decomposition: Decomposition) -> Array:

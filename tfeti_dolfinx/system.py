@@ -54,6 +54,10 @@ from tfeti_dolfinx.subdomains.subdomains import (
 OF_TANGENT = 5
 
 
+# how far was searched in each contact, and the owned groups whose nodes have rows
+Rows = tuple[Sequence[float], Sequence[Array]]
+
+
 @dataclass(frozen=True)
 class Settings:
     """Settings of a solve, and what they make."""
@@ -239,7 +243,7 @@ class System(Generic[OwnForms]):
         self.weights: Array | None = None
         self._K: Any = None
         self._search: ContactSearch | None = None
-        self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
+        self._known_rows: Rows | None = None
         self.known_friction: Array | None = None
         self._prescribed: Prescribed | None = None
         self._conditions: list[fem.DirichletBC] | None = None  # that it is of, with their values
@@ -345,11 +349,17 @@ class System(Generic[OwnForms]):
         rest = np.zeros(self.subdomains.num_nodal) if self._rest is None else self._rest
         return np.append(rest, self.tools.at_begin()[: self.tools.num_local])
 
-    def know_rows(
-        self, reach: Sequence[float], groups: Sequence[Array], secondary: Sequence[int]
-    ) -> None:
-        """Let the next search end with the rows and sides that an earlier one of the scene had."""
-        self._known_rows, self._secondary = (reach, groups), list(secondary)
+    def rows(self) -> Rows | None:
+        """Return the rows that the last search ended with; None before the first."""
+        return None if self._search is None else self._search.rows()
+
+    def know_rows(self, rows: Rows | None, secondary: Sequence[int] | None = None) -> None:
+        """Let the next search end with the rows and sides that an earlier one of the scene had.
+
+        Without rows it is as the first one, without sides they stay.
+        """
+        self._known_rows = rows
+        self._secondary = self._secondary if secondary is None else list(secondary)
         self.change("points")
 
     def make(self, seconds: MutableMapping[str, float]) -> Dual:

@@ -115,29 +115,38 @@ def frozen(expression: Any) -> Any:
     return Freezable(expression).frozen()()
 
 
-def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
-    """A UFL expression at the nodes of each cell, discontinuous between cells. Collective.
+def interpolating(expression: Any, W: fem.FunctionSpace) -> Callable[[fem.Function], None]:
+    """Return what sets a function of the discontinuous space W to what a UFL expression is then.
 
     What has internal variables is known at their points alone: it is fitted there, by a linear
     function in each cell if they are enough, else by a constant.
     """
-    element = ("DG", dofs.V.element.basix_element.degree, expression.ufl_shape)
-    W = fem.functionspace(dofs.V.mesh, element if expression.ufl_shape else element[:2])
-    function = fem.Function(W, name=name)
     nodes = interpolation_points(W)
     elements = (f.ufl_element() for f in extract_coefficients(expression))
     internal = (e.custom_quadrature()[0] for e in elements if e.has_custom_quadrature)
     if (points := next(internal, None)) is None:
-        function.interpolate(fem.Expression(expression, nodes))
-        return function
+        at_nodes = fem.Expression(expression, nodes)
+        return lambda function: function.interpolate(at_nodes)
     layout, bs = np.asarray(W.dofmap.list), W.dofmap.index_map_bs
-    cells = np.arange(len(layout), dtype=np.int32)
-    there = fem.Expression(expression, points).eval(W.mesh, cells)
+    cells, there = np.arange(len(layout), dtype=np.int32), fem.Expression(expression, points)
     terms = slice(None) if len(points) > points.shape[1] else slice(1)
     linear = [np.column_stack((np.ones(len(x)), x))[:, terms] for x in (nodes, points)]
     fit = linear[0] @ np.linalg.pinv(linear[1])
-    values = np.einsum("np,cpk->cnk", fit, there.reshape(len(cells), len(points), bs))
-    function.x.array.reshape(-1, bs)[layout] = values
+
+    def interpolate(function: fem.Function) -> None:
+        values = there.eval(W.mesh, cells).reshape(len(cells), len(points), bs)
+        found = np.einsum("np,cpk->cnk", fit, values)
+        function.x.array.reshape(-1, bs)[layout] = found
+
+    return interpolate
+
+
+def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
+    """A UFL expression at the nodes of each cell, discontinuous between cells. Collective."""
+    element = ("DG", dofs.V.element.basix_element.degree, expression.ufl_shape)
+    W = fem.functionspace(dofs.V.mesh, element if expression.ufl_shape else element[:2])
+    function = fem.Function(W, name=name)
+    interpolating(expression, W)(function)
     return function
 
 
@@ -212,8 +221,7 @@ class StressRecovery:
             # where another entry of the strain is not 0, the same entry of the stress is (plane
             # stress), or it has no derivative of u, and its error is of higher order (axisymmetry)
             e = ufl.as_tensor([[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, 0]])
-        points = interpolation_points(W)
-        self._pairs = [(fem.Expression(tensor, points), fem.Function(W)) for tensor in (sigma, e)]
+        self._pairs = [(interpolating(tensor, W), fem.Function(W)) for tensor in (sigma, e)]
         self.cells = fem.functionspace(mesh, ("DG", 0))
         self.cell_dof = np.asarray(self.cells.dofmap.list)[:, 0]
         stress, strain = (function for _, function in self._pairs)
@@ -223,8 +231,8 @@ class StressRecovery:
 
     def squares(self) -> Array:
         """∫(σ* − σ_h) : (ε* − ε_h) over each local cell, shape ``(cells,)``."""
-        for expression, function in self._pairs:
-            function.interpolate(expression)
+        for interpolate, function in self._pairs:
+            interpolate(function)
             layout = np.asarray(function.function_space.dofmap.list)
             values = function.x.array.reshape(-1, 9)[layout]
             function.x.array.reshape(-1, 9)[layout] = self._recovered(values) - values

@@ -1,7 +1,7 @@
 """Forms of Newton's method: its matrix and load, on the mesh as it was or as it is."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, ClassVar
 
 import basix
@@ -16,7 +16,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import least
-from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.assembly import Data, Forms
 from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
@@ -96,18 +96,21 @@ class NewtonForms(Forms):
     names: ClassVar[tuple[str, str]] = ("J", "F")
 
     def __init__(
-        self, J: ufl.Form, F: ufl.Form, *as_forms: Any, u: fem.Function, finite: bool
+        self,
+        J: ufl.Form,
+        F: ufl.Form,
+        *as_forms: Any,
+        u: fem.Function,
+        places: "CurrentPlaces | None",
     ) -> None:
-        self._u, self.kept = u, False
+        self._u, self._places, self.kept = u, places, False
         self.known: Array | None = None
         self.at_model: Array = np.zeros(0)
-        self._x = u.function_space.mesh.geometry.x
-        self._reference = self._x.copy() if finite else None
         self._matrix: csr_array | None = None
         mesh, tdim = u.function_space.mesh, u.function_space.mesh.topology.dim
         cells = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
         # strains are differences to the identity, and displacements of nodes to those beside them
-        self._length = float(mesh.h(tdim, cells).max(initial=0.0)) if finite else 0.0
+        self._length = 0.0 if places is None else float(mesh.h(tdim, cells).max(initial=0.0))
         super().__init__(J, F, *as_forms)
         dead = dead_loads(F, u)
         self._dead = None if dead.empty() else self._compiled(dead, self.names[1])
@@ -149,18 +152,9 @@ class NewtonForms(Forms):
         with self._in_place():
             return super().load()
 
-    @contextmanager
-    def _in_place(self) -> Iterator[None]:
+    def _in_place(self) -> AbstractContextManager[None]:
         """Integrate over the mesh as it was, in finite strain."""
-        if self._reference is None:
-            yield
-            return
-        here = self._x.copy()
-        self._x[:] = self._reference
-        try:
-            yield
-        finally:
-            self._x[:] = here
+        return nullcontext() if self._places is None else self._places.at_rest()
 
 
 class InertialNewtonForms(NewtonForms):
@@ -174,15 +168,17 @@ class InertialNewtonForms(NewtonForms):
 
     has_mass: ClassVar[bool] = True
 
-    def __init__(self, mass: ufl.Form, *as_forms: Any, u: fem.Function, finite: bool) -> None:
-        super().__init__(*as_forms, u=u, finite=finite)
+    def __init__(self, mass: ufl.Form, *as_forms: Any, **given: Any) -> None:
+        super().__init__(*as_forms, **given)
         self.inertia = Inertia(mass, self._V, self._decomposition, self._compiled)
+        mesh, places = self._V.mesh, self._places
+        at_rest = (lambda: [mesh.geometry.x]) if places is None else lambda: [places.rest]
+        self._rest = Data(at_rest, self._decomposition.comm)
         self.given = {**self.given, "mass": mass}
 
     def changes(self, *kept: str) -> set[str]:
         """Return what is new, by inertia, too."""
-        found = super().changes(*kept)
-        return found | self.inertia.changes("points" in found and self._reference is None)
+        return super().changes(*kept) | self.inertia.changes(self._rest.has_changed())
 
     def stiffness(self) -> Any:
         """Return this rank's J/2 + 2M/τ²."""
@@ -224,7 +220,7 @@ class CurrentPlaces:
         V = u.function_space
         self._u, self._dofs, self._mesh = u, dofs, V.mesh
         self._here, self._moving = np.array(u.x.array), fem.Function(V)
-        self._points, self._nodes = V.mesh.geometry.x.copy(), V.tabulate_dof_coordinates()
+        self._rest: Array | None = None  # while the mesh is moved
         element = V.mesh.ufl_domain().ufl_coordinate_element()
         self._at_points = fem.Function(fem.functionspace(V.mesh, element))
         cells = np.asarray(self._at_points.function_space.dofmap.list)
@@ -234,9 +230,28 @@ class CurrentPlaces:
         self._det = fem.Expression(det, points)
         self._cells = np.arange(len(cells), dtype=np.int32)
 
+    @property
+    def rest(self) -> Array:
+        """X, which may be others between two solves."""
+        return self._mesh.geometry.x if self._rest is None else self._rest
+
+    @contextmanager
+    def at_rest(self) -> Iterator[None]:
+        """Put the mesh to X for a while. Not collective."""
+        x = self._mesh.geometry.x
+        here = x.copy()
+        x[:] = self.rest
+        try:
+            yield
+        finally:
+            x[:] = here
+
     def move(self, anew: bool) -> None:
         """Put mesh and nodes to X + u, u as it is now, else as it was the last time."""
-        gdim = self._mesh.geometry.dim
+        self.back()
+        x, gdim = self._mesh.geometry.x, self._mesh.geometry.dim
+        rest, nodes = x.copy(), self._u.function_space.tabulate_dof_coordinates()
+        self._rest = rest
         if anew:
             self._here = np.array(self._u.x.array)
         self._moving.x.array[:] = self._here
@@ -244,15 +259,14 @@ class CurrentPlaces:
         self._moving.interpolate(self._at_points)
         self.moved = self._moving.x.array
         moved = self._at_points.x.array.reshape(-1, gdim)
-        self._mesh.geometry.x[self._to, :gdim] = self._points[self._to, :gdim] + moved[self._from]
-        nodes = self._nodes.copy()
+        x[self._to, :gdim] = rest[self._to, :gdim] + moved[self._from]
         nodes[:, :gdim] += self._here.reshape(-1, gdim)
         self._dofs.nodes = nodes
 
     def back(self) -> None:
         """Put them to where they were. Not collective."""
-        self._mesh.geometry.x[:] = self._points
-        self._dofs.nodes = None
+        self._mesh.geometry.x[:] = self.rest
+        self._rest = self._dofs.nodes = None
 
     def smallest_volume_ratio(self) -> float:
         """Return the smallest det F at points of cells, u as it is now. Collective."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -164,13 +165,16 @@ class NonlinearContactProblem(ContactProblem):
         self._last_digit = EPSILON * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
         self._last_increment = self._loosest
-        self._places = CurrentPlaces(u, self.dofs) if finite else None
         if finite:
             self._check_rotations()
 
+    @cached_property
+    def _places(self) -> CurrentPlaces | None:
+        return CurrentPlaces(self.u, self.dofs) if self._finite else None
+
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
         given = (a, L, V, self.decomposition, *options)
-        return NewtonForms(*given, u=self.u, finite=self._finite)
+        return NewtonForms(*given, u=self.u, places=self._places)
 
     def _find(self) -> None:
         begin = np.array(self.u.x.array)
@@ -181,6 +185,7 @@ class NonlinearContactProblem(ContactProblem):
         except TfetiError:  # on all ranks
             self._system.forms.kept = False
             self._set(begin)
+            self._system.tools.go_back()
             self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:

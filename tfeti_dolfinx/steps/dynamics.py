@@ -453,7 +453,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any
     ) -> InertialNewtonForms:
         given = (self._mass_form(V), a, L, V, self.decomposition, *options)
-        return InertialNewtonForms(*given, u=self.u, finite=self._finite)
+        return InertialNewtonForms(*given, u=self.u, places=self._places)
 
     def _find(self) -> None:
         last = np.array(self.u.x.array)
