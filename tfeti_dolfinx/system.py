@@ -23,7 +23,7 @@ from tfeti_dolfinx.contact.records import (
     mean_of_copies,
     slips,
 )
-from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.contact.search import ContactSearch, KnownRows
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import Extensions
@@ -52,10 +52,6 @@ from tfeti_dolfinx.subdomains.subdomains import (
 
 # a tangent of Newton's method serves this part of the multiplications of a stiffness that stays
 OF_TANGENT = 5
-
-
-# how far was searched in each contact, and the owned groups whose nodes have rows
-Rows = tuple[Sequence[float], Sequence[Array]]
 
 
 @dataclass(frozen=True)
@@ -243,7 +239,7 @@ class System(Generic[OwnForms]):
         self.weights: Array | None = None
         self._K: Any = None
         self._search: ContactSearch | None = None
-        self._known_rows: Rows | None = None
+        self._known_rows: KnownRows | None = None
         self.known_friction: Array | None = None
         self._prescribed: Prescribed | None = None
         self._conditions: list[fem.DirichletBC] | None = None  # that it is of, with their values
@@ -349,11 +345,11 @@ class System(Generic[OwnForms]):
         rest = np.zeros(self.subdomains.num_nodal) if self._rest is None else self._rest
         return np.append(rest, self.tools.at_begin()[: self.tools.num_local])
 
-    def rows(self) -> Rows | None:
+    def rows(self) -> KnownRows | None:
         """Return the rows that the last search ended with; None before the first."""
         return None if self._search is None else self._search.rows()
 
-    def know_rows(self, rows: Rows | None, secondary: Sequence[int] | None = None) -> None:
+    def know_rows(self, rows: KnownRows | None, secondary: Sequence[int] | None = None) -> None:
         """Let the next search end with the rows and sides that an earlier one of the scene had.
 
         Without rows it is as the first one, without sides they stay.

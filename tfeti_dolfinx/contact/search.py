@@ -17,6 +17,9 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
+# how far was searched in each contact, and the owned groups whose nodes have rows
+KnownRows = tuple[list[float], list[Array]]
+
 
 class ContactSearch:
     """Conditions of all contacts. Creation and all methods are collective.
@@ -104,8 +107,8 @@ class ContactSearch:
             records[i] = self._from_origin(i, replace(records[i], gap=values))
         self.contacts, self._records = contacts, records
 
-    def rows(self) -> tuple[list[float], list[Array]]:
-        """Return the reach of each contact, and the owned groups whose nodes have rows."""
+    def rows(self) -> KnownRows:
+        """Return the rows that conditions have."""
         return list(self._reach), [r.group[r.within_reach] for r in self._records]
 
     def move(self) -> None:
