@@ -425,6 +425,10 @@ class Contact(ContactPartner):
         size, per_area = _ratios(found, sides, dofs, stiffness)
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
         exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0
+        if self.secondary == "auto" and dofs.nodes is not None:
+            other = settled._meet(sides[::-1], dofs, contact, reach, reach)
+            partly = [any_rank(dofs.comm, _covered_in_part(r)) for r in (found, other)]
+            exchange = exchange if partly[0] == partly[1] else partly[0]
         if self.secondary == "auto" and exchange:
             settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
             size, per_area = 1.0 / size, 1.0 / per_area
@@ -513,6 +517,11 @@ class Contact(ContactPartner):
                 f'{self.name}: secondary={self.secondary!r}, expected one of its surfaces or "auto"'
             ) from None
         return replace(self, a=self.b, b=self.a) if named else self
+
+
+def _covered_in_part(records: ContactRecords) -> Array:
+    """Return flags of conditions within reach at nodes that the other side covers in part."""
+    return records.within_reach & (records.covered < 1.0 - SEARCH.hardly_covered)
 
 
 def _written(surface: object) -> str:
