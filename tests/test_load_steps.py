@@ -143,8 +143,7 @@ def test_files_of_a_series(shared_tmp):
     # the series goes on to times that it did not have, in the same process too
     more = Driven()
     steps = tfeti.LoadSteps(more.problem, more.apply, TIMES[:4], path=path, checkpoint=folder)
-    records = steps.run(resume=True)
-    assert [r.time for r in records] == TIMES[:4]
+    assert [r.time for r in steps.run(resume=True)] == TIMES[:4]
     assert number_of_steps(path) == 4
 
 

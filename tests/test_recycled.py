@@ -54,8 +54,7 @@ def test_images_stay_right_over_many_solves_on_many_faces():
     scene, rng = Repeated("triangle", recycle=15), np.random.default_rng(3)
     for load, held in rng.uniform([-0.2, -0.02], [0.05, 0.02], (20, 2)):
         scene.solve(load=load, held=held)
-    known = scene.problem.dual.recycled
-    assert known.count == 15
+    assert scene.problem.dual.recycled.count == 15
     worst, apart = images(scene.problem)
     assert worst <= 1e-11
     assert apart <= 1e-11
