@@ -368,7 +368,8 @@ class Contact(ContactPartner):
         b: Name or tag of the other one.
         secondary: The surface that carries the multipliers and the pressure, ``a`` or ``b``.
             "auto": the one with the coarser mesh where they meet; where both are of one size
-            (to 12 %), the softer one, by the stiffness per area of its elements, E/h.
+            (to 12 %), the softer one, by the stiffness per area of its elements, E/h. In finite
+            strain the one that the other covers wholly, if that is one alone.
         gap: "geometry" for the distance between the facets; "curved" for that between smooth
             surfaces fitted to straight facets, as pins and bearings need it; or what replaces the
             distance where it is at most the reach (negative: interference): a number, or a
@@ -414,7 +415,8 @@ class Contact(ContactPartner):
         """Return the contact with its secondary side as ``a``, and its conditions. Collective.
 
         The secondary side is that which is named, else the one with the coarser mesh; where meshes
-        are of one size, the softer one; of equal ones the first.
+        are of one size, the softer one; of equal ones the first. In finite strain it is the one
+        that is covered wholly, if that is one alone: what is covered in part changes.
         """
         cite("mortar")
         settled = self._named_first(dofs.decomposition)
