@@ -40,11 +40,9 @@ def test_copies_are_in_different_subdomains_the_lowest_first_and_found_with_thei
         own = slice(dofs.copy_offsets[g], dofs.copy_offsets[g + 1])
         assert np.all(np.diff(dofs.copy_subdomains[own]) > 0)
     assert dofs.comm.allreduce(int(dofs.multiplicity.max(initial=0)), op=MPI.MAX) >= 4
-    start = dofs.group_offsets[dofs.comm.rank]
-    own = start + np.arange(dofs.num_groups)
+    own = dofs.group_offsets[dofs.comm.rank] + np.arange(dofs.num_groups)
     assert np.array_equal(dofs.spread(own), dofs.group)
-    counts = dofs.reduce(np.ones(dofs.num_nodes), np.add)
-    assert np.array_equal(counts, dofs.multiplicity)
+    assert np.array_equal(dofs.reduce(np.ones(dofs.num_nodes), np.add), dofs.multiplicity)
     asked = (own * 7 + 3) % dofs.group_offsets[-1]
     (found,) = dofs.lookup(asked, own)
     assert np.array_equal(found, asked)
