@@ -357,6 +357,7 @@ def small(comm):
         ({"J": "skew"}, "not symmetric .* or the tangent of an energy"),
         ({"finite": True}, "no J"),
         ({"state": {1: 2}}, "state: a key"),
+        ({"state": "elsewhere"}, "state: the new value of f: the function 'f' is on another mesh"),
         ({"update": 3}, "update"),
         ({"u": None}, "u is"),
     ],
@@ -367,6 +368,7 @@ def test_mistakes_are_named(change, said, comm):
     forms = {"F": elastic.a(u, v), "J": elastic.a(du, v)}
     meant = {"square": ufl.inner(v, v) * ufl.inner(u, v) * ufl.dx, "energy": u[0] ** 2 * ufl.dx}
     meant["dead"] = elastic.a(fem.Function(u.function_space), v)
+    meant["elsewhere"] = {u: small(comm)[1]}
     meant["skew"] = forms["J"] + 0.1 * du[0].dx(1) * v[1] * ufl.dx
     change = {k: meant[to] if isinstance(to, str) else to for k, to in change.items()}
     given = {**forms, "u": u, **change}

@@ -142,7 +142,7 @@ class ContactProblem:
         if stress is not None:
             with agreeing(comm, "stress(u)") as given:
                 given["stress(u)"] = sigma = self._look_at_stress()
-                check_mesh(sigma, "stress", decomposition)
+                check_mesh(sigma, "stress", decomposition.mesh)
         if self.options.rtol == "auto" and stress is None:
             raise InputError(
                 f"-{petsc_options_prefix}rtol auto: the problem has no stress to estimate the "

@@ -63,7 +63,7 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
         check_same_space(space, V, f"the test function of {name}", f"that of {LINEAR[name]}")
     with raised_on_all_ranks(decomposition.comm):
         for integral in form.integrals():
-            check_mesh(integral.integrand(), name, decomposition)
+            check_mesh(integral.integrand(), name, decomposition.mesh)
         _check_measures(form, name, decomposition)
     for integral in form.integrals():
         _check_tags(integral, name, decomposition)
@@ -166,12 +166,12 @@ def check_same_space(V: Any, W: fem.FunctionSpace, what: str, whose: str) -> Non
         )
 
 
-def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None:
+def check_mesh(expression: Any, name: str, mesh: dmesh.Mesh) -> None:
     """Raise if an expression takes functions or geometry from another mesh.
 
     Constants may be from any: they are numbers.
     """
-    domain = decomposition.mesh.ufl_domain()
+    domain = mesh.ufl_domain()
     for term in traverse_unique_terminals(expression):
         for kind, expected in ((ufl.Coefficient, fem.Function), (ufl.Constant, fem.Constant)):
             if isinstance(term, kind) and not isinstance(term, expected):

@@ -212,8 +212,7 @@ def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Rang
             return fem.Constant(mesh, checked_number(value, what, expected))
         if value.ufl_shape != ():
             raise InputError(f"{what} is of shape {value.ufl_shape}; expected a scalar")
-        if isinstance(on, Decomposition):
-            check_mesh(value, what, on)
+        check_mesh(value, what, mesh)
         values = np.zeros(0)
         if isinstance(value, fem.Constant):
             values = value.value.ravel()

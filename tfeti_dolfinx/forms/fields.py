@@ -69,7 +69,7 @@ def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
         return checked_number(thickness, "thickness", POSITIVE)
     if thickness.ufl_shape != ():
         raise InputError(f"thickness is of shape {thickness.ufl_shape}; expected a scalar")
-    check_mesh(thickness, "thickness", decomposition)
+    check_mesh(thickness, "thickness", decomposition.mesh)
     if extract_arguments(thickness):
         raise InputError("thickness has a test or trial function; expected a scalar with values")
     if isinstance(thickness, fem.Constant):

@@ -96,7 +96,7 @@ def node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array
                 distance = np.take_along_axis(distance, order, axis=1)
                 share = np.rint(1e6 * distance / distance.sum(axis=1, keepdims=True))
                 place = (share * (1 + np.arange(len(vertices)))).sum(axis=1)
-                key[nodes] += mix(place.astype(np.uint64))
+                key[nodes] = mix(key[nodes] + place.astype(np.uint64))
     return origin, key
 
 
@@ -261,7 +261,8 @@ class TornDofs:
         It tells each, of those on boundaries of subdomains, the owner: that of the lowest.
         """
         decomposition = self.decomposition
-        key = mix(key + mix(decomposition.body_of_subdomain[self.node_subdomain]))
+        body = decomposition.body_of_subdomain[self.node_subdomain].astype(np.uint64)
+        key = mix(mix(key) + body)  # a sum of both mixed is the same where numbers change places
         owner = np.full(self.num_nodes, self.comm.rank, dtype=np.int64)
         facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
         fdim = decomposition.mesh.topology.dim - 1

@@ -13,6 +13,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.common.validation import checked_type, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.forms.checks import check_mesh
 
 NewValue = Any  # a UFL expression, or a callable that returns an array of the function's size
 
@@ -51,6 +52,7 @@ class InternalVariables:
                 )
             V = function.function_space
             with raised_on_all_ranks(self._comm), named(f"{name} cannot be compiled"):
+                check_mesh(value, name, mesh)
                 expression = fem.Expression(value, interpolation_points(V))
             self._new[function] = partial(_interpolated, expression, fem.Function(V))
         self.functions = list(given)
