@@ -427,14 +427,14 @@ class Contact(ContactPartner):
         size, per_area = _ratios(found, sides, dofs, stiffness)
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
         exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0
-        if self.secondary == "auto" and dofs.nodes is not None:
+        finite = dofs.nodes is not None
+        if self.secondary == "auto" and (exchange or finite):
             other = settled._meet(sides[::-1], dofs, contact, reach, reach)
-            partly = [any_rank(dofs.comm, _covered_in_part(r)) for r in (found, other)]
-            exchange = exchange if partly[0] == partly[1] else partly[0]
-        if self.secondary == "auto" and exchange:
-            settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
-            size, per_area = 1.0 / size, 1.0 / per_area
-            found = settled._meet(sides, dofs, contact, reach, reach)
+            partly = [finite and any_rank(dofs.comm, _covered_in_part(r)) for r in (found, other)]
+            # what is covered in part decides where it is so on one side alone
+            if partly[0] if partly[0] != partly[1] else exchange:
+                settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
+                size, per_area, found = 1.0 / size, 1.0 / per_area, other
         facets = sides[0].facets
         cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
         edges = count_over(dofs.comm, cosine < SEARCH.crease)
