@@ -29,6 +29,7 @@ ROOMS = [
     ["extensions"],
     ["solution"],
     ["report", "saved_state"],
+    ["settings"],
     ["system", "io"],
     ["accuracy"],
     ["problem"],

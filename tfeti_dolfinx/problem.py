@@ -40,12 +40,13 @@ from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.report import Outcome, Report, SolverCounts, added
 from tfeti_dolfinx.saved_state import SavedState, check_state
+from tfeti_dolfinx.settings import Settings
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod, Subdomains
-from tfeti_dolfinx.system import Settings, System
+from tfeti_dolfinx.system import System
 
 log = logging.getLogger(__name__)
 
@@ -128,8 +129,8 @@ class ContactProblem:
             self.bcs = listed_conditions(bcs)
             given |= {"a": a, "L": L, "bcs": self.bcs, "contacts": contacts, "thickness": thickness}
             given |= {"stress": stress, "u": u, "boundary_elements": boundary_elements}
-            given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
-            given |= self._given_besides()
+            given |= {"form_compiler_options": form_compiler_options}
+            given |= self._settings.given | self._given_besides()
         V = displacement_space(a, decomposition, self.form_name)
         self._seconds = dict(decomposition.seconds)  # of the next solve
         with stage("constraints", self._seconds):
@@ -153,8 +154,7 @@ class ContactProblem:
         self._in_all: dict[str, float] = {}
         self._logged: set[str] = set()  # warnings
         self._solution: Solution | None = None
-        # flags of the bodies that move freely in the last solution, if contact has held some
-        self._let_go: Array = np.zeros(0, dtype=bool)
+        self._let_go: Array = np.zeros(0, dtype=bool)  # flags of bodies that contact has let go
         self._start: Start | None = None
         self._accepted: tuple[Solution, Start] | None = None
         self._boundary_elements = boundary_elements
@@ -338,13 +338,12 @@ class ContactProblem:
     def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""
         records = self._system.sizes(), self._system.take_counts(), self._counts, self._outcome
-        comm = self.decomposition.comm
-        report = Report.composed(records, self._seconds, self._in_all, comm)
+        report = Report.composed(records, self._seconds, self._in_all, self.dofs.comm)
         vars(self.report).update(vars(report))  # a program may hold it over many solves
         self._seconds, self._in_all = {}, report.in_all
 
     def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
-        tools = self._system.tools
+        system, tools = self._system, self._system.tools
         if tools:
             motion = tools.motion(gluing.records, found=True)
             gluing = replace(gluing, records=replace(gluing.records, motion=motion))
@@ -353,13 +352,12 @@ class ContactProblem:
             lam=lam,
             face=face,
             gluing=gluing,
-            contacts=list(self._system.search.contacts),
+            contacts=list(system.search.contacts),
             stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
         )
-        solution.finite = self._system.origin is not None
-        solution.boundary = self._system.elements.solved(u)
-        solution.tool_motions, solution.friction = tools.motions(), self._system.known_friction
+        solution.finite, solution.boundary = system.origin is not None, system.elements.solved(u)
+        solution.tool_motions, solution.friction = tools.motions(), system.known_friction
         return solution
 
     # ------------------------------------------------------- after a solve
@@ -376,8 +374,7 @@ class ContactProblem:
         """
         self._meet("estimate")
         found = estimate(self._system, self.solution, self._rounding)
-        known = {name: value for name, value in vars(found).items() if value is not None}
-        self.report.estimates = known
+        self.report.estimates = {n: x for n, x in vars(found).items() if x is not None}
         kept = [text for text in self.report.warnings if not text.startswith(ESTIMATES)]
         self.report.warnings = [*kept, *of_estimates(self.report)]
         self._log_warnings()
@@ -432,13 +429,13 @@ class ContactProblem:
         their names. Options, extensions and ``stress`` are none of it.
         ``agreement.check_same_problem`` compares two of them.
         """
-        comm, d = self.decomposition.comm, self.decomposition
-        with agreeing(comm, "digest") as given:
+        d = self.decomposition
+        with agreeing(d.comm, "digest") as given:
             given |= self._given()
         known = {name: x for name, x in given.items() if name not in self._unknown_before}
         fields = fields_in(known)
         mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
-        sums = sums_of(comm, [d.mesh.geometry.x, *fields.values()])
+        sums = sums_of(d.comm, [d.mesh.geometry.x, *fields.values()])
         found = {name: described(value) for name, value in given.items()}
         found["mesh"] = {**mesh, "points": sums[0]}
         found["sums over functions"] = dict(zip(fields, sums[1:], strict=True))
@@ -473,8 +470,7 @@ class ContactProblem:
                 raise InputError("the last solve has not converged; expected one that has")
         if start is None or (self._accepted and self._accepted[0] is solution):
             return
-        tools = self._system.tools
-        tools.begin = [tools.pose(i) for i in range(len(tools))]
+        self._system.tools.begin_here()
         self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
         self._accepted = (solution, start)
 
@@ -591,8 +587,8 @@ class ContactProblem:
     def _given(self) -> dict[str, Any]:
         """Return what determines the solution at present, by name. Not collective."""
         about = {"bcs": self.bcs, "contacts": self.contacts, "thickness": self._thickness}
-        elements = {"boundary_elements": self._boundary_elements}
-        return {**self._system.forms.given, **about, **elements}
+        about |= {"boundary_elements": self._boundary_elements}
+        return self._system.forms.given | about
 
     def _look_at_stress(self) -> Any:
         """Return the user's stress of ``u`` in UFL, which solutions take until the next look."""

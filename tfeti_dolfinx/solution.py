@@ -468,7 +468,7 @@ class Solution:
         """Slips along tangents that are prescribed, else no numbers; collective at first use."""
         if self.friction is None:
             return np.full(self.gluing.slip.shape, np.nan)
-        slip = self.gluing.forced_slip()
+        slip = self.gluing.prescribed_slip()
         slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
         return slip
 

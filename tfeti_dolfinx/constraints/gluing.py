@@ -136,7 +136,7 @@ class Gluing:
         at, (_, left, rounding) = self.contact.decided, self._held
         return np.asarray(at[np.abs(left[at]) <= rounding[at]])
 
-    def forced_slip(self) -> Array:
+    def prescribed_slip(self) -> Array:
         """Return slips along tangents that are prescribed, so have no row, ``(n, gdim - 1)``.
 
         They are those of conditions with friction and a normal row; others are not numbers.

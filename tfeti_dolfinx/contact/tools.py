@@ -167,6 +167,10 @@ class Tools:
         """Return where a body is after the last solve."""
         return self.poses[body].moved(self.steps()[body] + self.found[body])
 
+    def begin_here(self) -> None:
+        """Let a load step begin where the bodies are."""
+        self.begin = [self.pose(i) for i in range(len(self))]
+
     def go_back(self, motions: Array | None = None) -> None:
         """Return to where the load step began, or to motions of shape ``(bodies * k,)``."""
         if motions is not None:

@@ -248,9 +248,9 @@ class FrictionBounds:
             first = motion if first is None else first
             if motion is None or not self._others:
                 return None if motion is None else first
-            self.now = self._at_rest(self._others.pop(0))
+            self.now = self._shared_load(self._others.pop(0))
 
-    def _at_rest(self, share: float) -> Array:
+    def _shared_load(self, share: float) -> Array:
         """λ_N of points that bear a share of the load of a body over their number; ∞: all stick."""
         if np.isinf(share):
             return np.full(len(self._rows), np.inf)

@@ -32,11 +32,12 @@ from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.saved_state import SavedState
+from tfeti_dolfinx.settings import Settings
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, subdomain_data
-from tfeti_dolfinx.system import Settings, System
+from tfeti_dolfinx.system import System
 
 NAMES = ("load", "contact", "friction", "supports", "predictor")
 
@@ -267,9 +268,8 @@ class ContactDynamics(ContactProblem):
         self._system.forms.inertia.move(np.array(self.u.x.array), np.array(v))
         # slips of the first step count from where bodies and tools are now
         self._system.begin_at(self.dofs.to_primal(self.u.x.array))
-        tools = self._system.tools
-        tools.read(self.time)
-        tools.begin = [tools.pose(i) for i in range(len(tools))]
+        self._system.tools.read(self.time)
+        self._system.tools.begin_here()
         self._predictor = Predictor(self.dofs, self._settings) if stabilised else None
 
     def _given_besides(self) -> dict[str, Any]:
