@@ -250,6 +250,11 @@ def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:
                 _LINEAR_IN_ALL.add(signature)
         except ArityMismatch as error:  # a BaseException, which nobody else catches
             raise ValueError(error) from error
+        except KeyError as error:  # what UFL numbers meshes by
+            raise InputError(
+                f"{name}: SpatialCoordinate, FacetNormal or the like is on another mesh than the "
+                "measures (the one before decompose?); expected decomposition.mesh, the torn mesh"
+            ) from error
     return [argument.ufl_function_space() for argument in arguments]
 
 
