@@ -236,7 +236,7 @@ CASES = {
     ),
     "data of an unknown contact on one": (
         of_solution(lambda of: of.contact(0), lambda of: of.contact(3 if ODD else 0)),
-        "contact 3: expected a position or a name",
+        "contact 3: there is none; expected a position",
     ),
     "the reaction of another surface on one": (
         of_solution(lambda of: of.reaction("left"), lambda of: of.reaction("right")),

@@ -32,7 +32,7 @@ FORMS_AGAIN = {
 
 GAPS_AGAIN = {
     r"gap is \[0.1\]; expected a dictionary": gaps([0.1]),
-    r"contact 'lid': expected a position or a name that only one": gaps({"lid": 0.1}),
+    r"contact 'lid': there is none; expected a position or a name": gaps({"lid": 0.1}),
     r"gap: contact 0 is there twice, by position and by name": gaps({0: 0.1, FLOOR: 0.2}),
 }
 

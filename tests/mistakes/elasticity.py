@@ -24,17 +24,16 @@ def made(**changes):
     return lambda s: elastic(s, **{name: make(s) for name, make in changes.items()})
 
 
-def untorn(s):
-    return fem.Function(s.untorn_space("DG", 0), name="stiff")
-
-
 MODULI = {
     r"E=-2.0: expected a positive number": made(E=lambda s: fem.Constant(s.d.mesh, -2.0)),
     r"E is of shape \(2,\); expected a scalar": made(E=lambda s: fem.Function(s.V)),
-    r"E: the function 'stiff' is on another mesh \(the one before decompose\?\)": made(E=untorn),
+    r"E: the function 'stiff' is on another mesh \(the one before decompose\?\)": made(
+        E=lambda s: fem.Function(s.untorn_space("DG", 0), name="stiff")
+    ),
     r"E: no volume 'stel' in the mesh; its volumes are: 'steel' \(5\)": given(E={"stel": 1.0}),
-    r"E: 4 cells have no value; expected one for every volume, without one are: 'steel'": given(
-        E={}
+    r"E: 4 cells have no value; expected one for every volume, w.* are: 'steel'": given(E={}),
+    r"E: 2 cells have no value; expected every cell in a volume": lambda s: elastic(
+        s, on=tfeti.decompose(s.mesh, 2, volumes={"low": lambda x: x[1] < 0.6}), E={"low": 1.0}
     ),
     r"E: the volume 5 is there twice": given(E={"steel": 1.0, 5: 1.0}),
     r"E by volumes: expected a Decomposition, which knows their names": lambda s: elastic(

@@ -46,6 +46,7 @@ def other_ds(s):
 ARGUMENTS = {
     r"a is None; expected a bilinear form of UFL": lambda s: s.problem(a=None),
     r"a is a compiled form": lambda s: s.problem(a=fem.form(s.mass)),
+    r"a has 1 argument.*; expected a bilinear form, of a residual Nonl": lambda s: s.problem(a=s.L),
     r"L is None; expected a linear form.*ZeroBaseForm": lambda s: s.problem(L=None),
     r"a: an integral has no test function; expected a bilinear form": lambda s: s.problem(
         a=s.a + s.u[0] * s.dx

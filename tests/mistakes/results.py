@@ -38,8 +38,8 @@ FIELDS = {
     r"there is no solution yet; expected a call of solve\(\) before": lambda s: (
         s.problem().solution
     ),
-    r"contact 'bottom': expected .*, of 0: obstacle of surface 'bottom'; name=": contact("bottom"),
-    r"contact .*bottom.*: expected a pos.*, of 0: obstacle .*, 1: obstacle": lambda s: (
+    r"contact 'bottom': there is none; .*, of 0: obstacle of surface 'bottom'": contact("bottom"),
+    r"contact .*bottom.*: several have this name; .*, of 0: .*, 1: obstacle": lambda s: (
         s.twice.contact("obstacle of surface 'bottom'")
     ),
     r"no stress: give ContactProblem\(..., stress=sigma\)": lambda s: s.bare.stress,

@@ -151,9 +151,10 @@ def position_of(names: Sequence[str], which: int | str, what: str = "contact") -
     if isinstance(which, str) and names.count(which) == 1:
         return names.index(which)
     known = ", ".join(f"{i}: {name}" for i, name in enumerate(names)) or "none"
+    several = isinstance(which, str) and which in names
     raise InputError(
-        f"{what} {shown(which)}: expected a position or a name that only one of them has, of "
-        f"{known}; name= gives names"
+        f"{what} {shown(which)}: {'several have this name' if several else 'there is none'}; "
+        f"expected a position or a name, of {known}; name= gives names"
     )
 
 

@@ -237,7 +237,8 @@ def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:
     with named(f"{name} is not {expected}"):
         arguments = form.arguments()
     if len(arguments) != arity:
-        raise InputError(f"{name} has {len(arguments)} arguments; expected {expected}")
+        hint = ", of a residual NonlinearContactProblem" if name == "a" and arguments else ""
+        raise InputError(f"{name} has {len(arguments)} argument(s); expected {expected}{hint}")
     for integral in form.integrals():
         parts = {argument.number() for argument in extract_arguments(integral.integrand())}
         if missing := set(range(arity)) - parts:
