@@ -42,7 +42,7 @@ def test_free_flight_is_exact(cell, stabilised):
     assert largest(v[:, -1] + 0.3 + 0.5 * 0.5) <= 1e-12
 
 
-def test_the_mass_of_a_ring_is_that_of_its_radius():
+def test_the_mass_of_a_ring_is_that_of_its_radius(shared_tmp):
     """The kinetic energy of the velocity (r, 0) of a cone of radius R(z) is π/4 ∫R⁴."""
     d = decomposed("triangle", 2, 2)
     d.mesh.geometry.x[:, 0] *= 1.0 + 0.5 * d.mesh.geometry.x[:, 1]
@@ -51,7 +51,10 @@ def test_the_mass_of_a_ring_is_that_of_its_radius():
     grows.interpolate(lambda x: np.stack((x[0], 0.0 * x[0])))
     given = {"mass": 1.0, "velocity": grows, "thickness": law.thickness}
     p = tfeti.ContactDynamics(law.a(u, v), ufl.ZeroBaseForm((v,)), [], [], d, **given)
-    (record,) = tfeti.LoadSteps(p, lambda p, t: None, [1e-6]).run()
+    steps = tfeti.LoadSteps(p, lambda p, t: None, [1e-6])
+    (record,) = steps.run()
+    steps.write_csv(shared_tmp / "ring.csv")
+    assert ",kinetic,elastic,energy," in (shared_tmp / "ring.csv").read_text()
     assert record.motion["kinetic"] == pytest.approx(np.pi / 10 * (1.5**5 - 1), rel=1e-5)
 
 
@@ -64,8 +67,7 @@ def test_the_energy_changes_by_what_was_done(cell, below, stabilised):
     What contact takes is its force times the gap that it closes, λᵀ(g − Bu).
     """
     scene = Thrown(cell, 3, below=below, stabilised=stabilised, weight=0.02)
-    comm, gaps = scene.problem.decomposition.comm, None
-    impacts, most = 0, 0.0
+    comm, gaps, impacts, most = scene.problem.decomposition.comm, None, 0, 0.0
     for n in range(12):
         scene.weight.value[0] = 0.01 * n
         ((motion, forces),) = scene.step(0.1)
@@ -87,8 +89,7 @@ def test_the_energy_changes_by_what_was_done(cell, below, stabilised):
 def test_an_obstacle_that_moves_does_work():
     """A plane comes up under the box: what contact does is −λᵀ(g⁺ − g) less what it closes."""
     scene = Thrown("quadrilateral", 3, stabilised=True, thrown=(0.0, 0.0, 0.0))
-    comm, gaps, speed = scene.problem.decomposition.comm, None, 0.2
-    work = 0.0
+    comm, gaps, speed, work = scene.problem.decomposition.comm, None, 0.2, 0.0
     for n in range(1, 16):
         scene.problem.update(gap={"plane": 0.02 - speed * 0.1 * n})
         ((motion, _),) = scene.step(0.1)
@@ -99,8 +100,7 @@ def test_an_obstacle_that_moves_does_work():
             assert motion["contact"] == pytest.approx(-closed, rel=0, abs=1e-9)
         work += motion["contact"]
         gaps = np.array(solution.remaining_gap)
-    v = scene.problem.solution.velocity.x.array.reshape(-1, 2)
-    momentum = mean(scene, v)
+    momentum = mean(scene, scene.problem.solution.velocity.x.array.reshape(-1, 2))
     # an elastic body leaves with twice the speed of the plane, less what swings in it
     assert speed < momentum[-1] <= 2 * speed
     assert work >= 0.5 * momentum[-1] ** 2

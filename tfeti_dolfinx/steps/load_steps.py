@@ -299,7 +299,7 @@ class LoadSteps:
         """Write a table of the steps so far, a line a step, by rank 0. Collective.
 
         Columns: time, the force on each contact by name and axis, motion and forces of each rigid
-        body, what friction dissipates, iterations (``F`` in older files), seconds.
+        body, ``report.motion`` of bodies with mass, what friction dissipates, iterations, seconds.
 
         Args:
             path: File, ending in ``.csv``; one that is there is replaced.
@@ -315,11 +315,12 @@ class LoadSteps:
         with raised_on_all_ranks(self._comm), named(f"cannot write {target}", OSError):
             if self._comm.rank == 0:
                 forces = [f"{name} {axis}" for name in names for axis in axes]
-                tools = list(self.records[0].tools) if self.records else []
+                others = [{**r.tools, **r.motion} for r in self.records]
+                known = list(others[0]) if others else []
                 last = ["dissipation", "iterations", "seconds"]
-                table: list[list[Any]] = [["time", *forces, *tools, *last]]
-                for r in self.records:
-                    values = [*chain(*r.contact_forces), *(r.tools[name] for name in tools)]
+                table: list[list[Any]] = [["time", *forces, *known, *last]]
+                for r, other in zip(self.records, others, strict=True):
+                    values = [*chain(*r.contact_forces), *(other[name] for name in known)]
                     count = r.figures["F_multiplications"]
                     table.append([r.time, *values, r.dissipation, count, r.seconds])
                 with (
