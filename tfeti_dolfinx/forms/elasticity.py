@@ -250,7 +250,7 @@ def _by_volume(
         given[cells] = True
     if missing := count_over(on.comm, ~given):
         others = {name: tag for name, tag in on.names.volumes.items() if tag not in by_tag}
-        without = f"one for every volume, without one are: {known_tags(others)}"
-        expected = without if others else "every cell in a volume, or one number for all"
-        raise InputError(f"{what}: {missing} cells have no value; expected {expected}")
+        for_all = f"one for every volume, without one are: {known_tags(others)}"
+        wanted = for_all if others else "every cell in a volume, or one number for all"
+        raise InputError(f"{what}: {missing} cells have no value; expected {wanted}")
     return function
