@@ -536,7 +536,10 @@ def test_distance_from_a_mesh_is_that_of_its_body():
     """Of a square and a cube exactly, next to sides, edges and corners too; of a ball with h²."""
     rng, step = np.random.default_rng(0), 1e-6
     for gdim, panels in SIDES.items():
-        mesh = tfeti.SurfaceMesh(panels.x, panels.nodes)
+        a, b, c = *panels.nodes[0, :2], len(panels.x)  # facets as thin as rounding do not count
+        corners = np.vstack((panels.x, panels.x[[a, b]].mean(axis=0) + 1e-10))
+        flat = [(a, a)] if gdim == 2 else [(a, a, b), (a, b, c)]
+        mesh = tfeti.SurfaceMesh(corners, [*panels.nodes, *flat])
         p = rng.uniform(-0.6, 1.6, (3, 400))
         x = p[:gdim]
         out = np.maximum(np.maximum(-x, x - 1.0), 0.0)
@@ -589,7 +592,7 @@ def test_a_tool_whose_edges_lie_on_nodes_presses_along_the_normal_of_the_body(gd
 def test_meshes_that_do_not_fit_are_named(comm):
     for points, facets, words in (
         ([(0, 0)], [(0, 1)], "not among 1"),
-        ([(0, 0, 0)] * 3, [(0, 1, 2)], "no extent"),
+        ([(0, 0, 0)] * 3, [(0, 1, 2)], "no facet has an extent"),
         ([(0, 0, 0)], [(0, 1)], "expected"),
         ([(0, 0), (1, 0)], [(0.0, 1.0)], "expected finite points, and integers"),
     ):

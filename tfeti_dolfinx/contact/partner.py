@@ -350,6 +350,10 @@ WORSE = (
     "%s: the secondary side %r is %.3g times as stiff per area as %r, where they meet; the "
     "pressure would be better with secondary=%r"
 )
+LITTLE = (
+    "%s: %r covers so little of the facets of the secondary side %r that nodes may lack "
+    "conditions; expected secondary=%r"
+)
 EDGES = (
     "%s: %r has edges; normals are averaged there. Give the sides of an edge names of their own, "
     "and a pair each"
@@ -370,7 +374,8 @@ class Contact(ContactPartner):
         secondary: The surface that carries the multipliers and the pressure, ``a`` or ``b``.
             "auto": the one with the coarser mesh where they meet; where both are of one size
             (to 12 %), the softer one, by the stiffness per area of its elements, E/h. In finite
-            strain the one that the other covers wholly, if that is one alone.
+            strain the one that the other covers wholly, if that is one alone. It is not one whose
+            facets are so large that the other covers less than 2 % around each node.
         gap: "geometry" for the distance between the facets; "curved" for that between smooth
             surfaces fitted to straight facets, as pins and bearings need it; or what replaces the
             distance where it is at most the reach (negative: interference): a number, or a
@@ -417,7 +422,8 @@ class Contact(ContactPartner):
 
         The secondary side is that which is named, else the one with the coarser mesh; where meshes
         are of one size, the softer one; of equal ones the first. In finite strain it is the one
-        that is covered wholly, if that is one alone: what is covered in part changes.
+        that is covered wholly, if that is one alone: what is covered in part changes. A side that
+        the other one covers by little at all nodes is secondary only if both are so.
         """
         cite("mortar")
         settled = self._named_first(dofs.decomposition)
@@ -428,20 +434,23 @@ class Contact(ContactPartner):
         size, per_area = _ratios(found, sides, dofs, stiffness)
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
         exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0
-        finite = dofs.nodes is not None
-        if self.secondary == "auto" and (exchange or finite):
+        worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
+        auto, finite = self.secondary == "auto", dofs.nodes is not None
+        little = not _is_believed(found, dofs)
+        if little or worse or (auto and (exchange or finite)):
             other = settled._meet(sides[::-1], dofs, contact, reach, reach)
-            partly = [finite and any_rank(dofs.comm, _covered_in_part(r)) for r in (found, other)]
-            # what is covered in part decides where it is so on one side alone
-            if partly[0] if partly[0] != partly[1] else exchange:
+            useful = _is_believed(other, dofs)  # `little` is so of the other side, too, or not
+            better = useful if useful == little else _is_better(other, found, dofs, exchange)
+            if better and auto:
                 settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
-                size, per_area, found = 1.0 / size, 1.0 / per_area, other
+                found = other
+            elif little and useful and dofs.comm.rank == 0:
+                log.warning(LITTLE, self.name, settled.b, settled.a, settled.b)
+            elif better and worse and dofs.comm.rank == 0:
+                log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
         facets = sides[0].facets
         cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
         edges = count_over(dofs.comm, cosine < SEARCH.crease)
-        worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
-        if worse and dofs.comm.rank == 0:
-            log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
         if edges and dofs.comm.rank == 0:
             log.warning(EDGES, self.name, settled.a)
         return settled, found
@@ -522,9 +531,23 @@ class Contact(ContactPartner):
         return replace(self, a=self.b, b=self.a) if named else self
 
 
-def _covered_in_part(records: ContactRecords) -> Array:
-    """Return flags of conditions within reach at nodes that the other side covers in part."""
-    return records.within_reach & (records.covered < 1.0 - SEARCH.hardly_covered)
+def _is_believed(records: ContactRecords, dofs: TornDofs) -> bool:
+    """Return whether the other side covers enough of a node for its pressure. Collective."""
+    return any_rank(dofs.comm, records.covered >= SEARCH.believed)
+
+
+def _is_better(other: ContactRecords, found: ContactRecords, dofs: TornDofs, coarser: bool) -> bool:
+    """Return whether the other side is the better secondary one. Collective.
+
+    In finite strain what is covered in part decides where it is so on one side alone.
+    """
+    if dofs.nodes is None:
+        return coarser
+    partly = [
+        any_rank(dofs.comm, r.within_reach & (r.covered < 1.0 - SEARCH.hardly_covered))
+        for r in (other, found)
+    ]
+    return partly[1] if partly[0] != partly[1] else coarser
 
 
 def _written(surface: object) -> str:

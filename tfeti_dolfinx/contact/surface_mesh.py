@@ -13,6 +13,9 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.gmsh_model import open_model
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
+# how thin a triangle without extent is, relative: its normal is that of rounding
+FLAT = 1e-7
+
 
 class SurfaceMesh:
     """A rigid shape with a surface of triangles, in 2D of lines.
@@ -28,7 +31,8 @@ class SurfaceMesh:
             first vertex to the second.
 
     Raises:
-        InputError: The arrays do not fit, or a facet has no extent.
+        InputError: The arrays do not fit, or no facet has an extent; those that have none, as
+            programs for drawing write them, are left out.
 
     Example:
         >>> roof = tfeti.SurfaceMesh([(1, 0), (0, 1), (-1, 0)], [(0, 1), (1, 2)])
@@ -60,21 +64,21 @@ class SurfaceMesh:
     def _find_normals(self) -> None:
         """Find normals of facets, and those at vertices and edges, and the tree of middles."""
         c = self._x[self._facets]
+        sides = np.roll(c, -1, axis=1) - c  # from each vertex to the next
         if self._gdim == 2:
-            along = c[:, 1] - c[:, 0]
-            normal = np.stack((along[:, 1], -along[:, 0]), axis=1)
-            angle = np.ones(self._facets.shape)
+            normal = np.stack((sides[:, 0, 1], -sides[:, 0, 0]), axis=1)
         else:
-            normal = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
-            to_next, to_last = np.roll(c, -1, axis=1) - c, np.roll(c, 1, axis=1) - c
-            cosine = np.sum(to_next * to_last, axis=2) / np.maximum(
-                np.linalg.norm(to_next, axis=2) * np.linalg.norm(to_last, axis=2), 1e-300
-            )
+            normal = np.cross(sides[:, 0], sides[:, 1])
+        length, longest = np.linalg.norm(normal, axis=1), np.linalg.norm(sides, axis=2).max(axis=1)
+        wide = length > FLAT * longest ** (self._gdim - 1)
+        if not np.any(wide):
+            raise InputError("SurfaceMesh: no facet has an extent")
+        self._facets, c, sides = self._facets[wide], c[wide], sides[wide]
+        self._normal, angle = normal[wide] / length[wide, None], np.ones(self._facets.shape)
+        if self._gdim == 3:
+            along = sides / np.linalg.norm(sides, axis=2, keepdims=True)
+            cosine = -np.sum(along * np.roll(along, 1, axis=1), axis=2)
             angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        if np.any(length == 0.0):
-            raise InputError(f"SurfaceMesh: facet {int(np.argmin(length))} has no extent")
-        self._normal = normal / length
         vertices = np.repeat(self._normal[:, None], self._gdim, axis=1) * angle[:, :, None]
         self._of_vertex = sum_rows(
             self._facets.ravel(), vertices.reshape(-1, self._gdim), len(self._x)
