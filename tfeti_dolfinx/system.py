@@ -282,12 +282,14 @@ class System(Generic[OwnForms]):
         for what in (name for name in CHANGES if name in changes):
             self.change(what)
         comm, given = self._dofs.comm, list(self.bcs)
-        if self._values.has_changed() or given != self._conditions:
+        if self._values.has_changed() or given != self._conditions or "points" in changes:
             self._conditions, old = None, self._prescribed  # what raises looks again
             new = self._prescribed = prescribe(self._dofs, given)
-            if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
+            if old is None:
                 self.change("constraints")
-                if old and self._search and self._search.sees(new.flag != old.flag):
+            elif any_rank(comm, differ := (new.flag != old.flag) | (new.across != old.across)):
+                self.change("constraints")
+                if self._search and self._search.sees(differ):
                     self.change("places")
             elif any_rank(comm, not np.array_equal(new.value, old.value)):
                 self.change("right side")
@@ -428,7 +430,7 @@ class System(Generic[OwnForms]):
         decided = before is not None or self._known_rows is not None
         stiffness = None if decided else self._blocks
         self._search = ContactSearch(
-            contacts, dofs, stiffness, self.origin, tools, made(self._prescribed).flag
+            contacts, dofs, stiffness, self.origin, tools, made(self._prescribed)
         )
         if before is None:
             tools.check_begin(contacts, self._search.records)

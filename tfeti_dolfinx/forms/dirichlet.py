@@ -8,6 +8,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import space_of
+from tfeti_dolfinx.common.parallel import box_over_ranks, summed
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
@@ -53,6 +54,7 @@ class Prescribed:
 
     flag: Array  # whether a component is prescribed, shape (g, bs)
     value: Array  # its value, 0 where it is not, shape (g, bs)
+    across: Array  # whether it is across a plane of symmetry, shape (g, bs)
 
 
 def prescribe(
@@ -86,7 +88,33 @@ def prescribe(
                 f"prescribed as {low[at]} and as {high[at]} "
                 f"(at {wrong.sum()} components of nodes on this rank)"
             )
-    return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
+    value = np.where(flag, low, 0.0)
+    return Prescribed(flag, value, across_symmetry(dofs, flag & (value == 0.0)))
+
+
+def across_symmetry(dofs: TornDofs, still: Array, near: float = 1e-9) -> Array:
+    """Return flags of components across planes of symmetry, shape ``(g, bs)``. Collective.
+
+    Such a plane is x_k = c with the whole mesh on one side of it, whose nodes there are all those
+    of facets in it, and have u_k = 0 prescribed (``still``); under axisymmetry x_0 = 0 alone. What
+    is within ``near``, over the mesh's extent, lies in it.
+    """
+    gdim = dofs.V.mesh.geometry.dim
+    if dofs.bs < gdim:
+        return np.zeros_like(still)
+    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
+    low, high = box_over_ranks(dofs.comm, x)
+    near *= np.max(high - low)
+    facets = dofs.facet_nodes(dofs.decomposition.boundary)
+    at = np.abs(x[:, None] - np.stack((low, high))) <= near  # both ends, shape (n, 2, gdim)
+    if dofs.axisymmetric:
+        at[np.abs(x[:, 0]) > near, :, 0] = False
+    flat = np.zeros_like(at)
+    np.logical_or.at(flat, facets, at[facets].all(axis=1)[:, None])
+    on, held = dofs.reduce(np.stack((at, flat), axis=1), np.logical_or).swapaxes(0, 1)
+    held &= still[:, None]
+    whole = summed(dofs.comm, np.sum(on & ~held, axis=0)) == 0
+    return np.any(held & whole, axis=1)
 
 
 def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
