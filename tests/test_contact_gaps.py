@@ -2,9 +2,20 @@
 
 import numpy as np
 import pytest
-from bodies import ORDERS, dofs_on, gathered, searched, sided, stacked, torn_boxes
+from bodies import (
+    ORDERS,
+    dofs_on,
+    gathered,
+    held,
+    no_load,
+    searched,
+    sided,
+    stacked,
+    torn_boxes,
+    two_body_problem,
+)
 from mpi4py import MPI
-from scenes import CELLS, decomposed, problem, solved
+from scenes import CELLS, apart, by_point, decomposed, displacement, problem, solved
 from true_errors import OVERLAP, ring_problem
 
 import tfeti_dolfinx as tfeti
@@ -28,13 +39,13 @@ def shaped(cell, n_lower, n_upper, lower, upper, across=(0.0, 1.0)):
     return d
 
 
-def bent(cell, n_lower, n_upper, lower, upper):
-    """Sides bent to c|x|², which touch at x = 0."""
+def bent(cell, n_lower, n_upper, lower, upper, at=np.array, gap=0.0):
+    """Sides bent to c|x|², so far apart at x = 0."""
 
-    def side(c):
-        return lambda x: c * np.sum(x**2, axis=1)
+    def side(c, start=0.0):
+        return lambda x: start + c * np.sum(at(x) ** 2, axis=1)
 
-    return shaped(cell, n_lower, n_upper, side(lower), side(upper))
+    return shaped(cell, n_lower, n_upper, side(lower), side(upper, gap))
 
 
 @pytest.mark.parametrize("sides", ORDERS)
@@ -90,6 +101,46 @@ def test_an_overhanging_wedge(cell, slope):
     gaps, expected = gathered(records.gap), slope * (x - start)
     assert np.sum(x > 0.5) == n ** (gdim - 2) + (gdim - 2)
     assert np.allclose(gaps, np.maximum(expected, 0.0), rtol=1e-3, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cell", "degree", "gap", "sides"),
+    [
+        ("quadrilateral", 2, "geometry", ORDERS[1]),
+        ("quadrilateral", 1, "curved", ORDERS[0]),
+        ("hexahedron", 1, "geometry", ORDERS[0]),
+    ],
+)
+def test_a_half_and_a_quarter_have_the_answer_of_the_whole(cell, degree, gap, sides):
+    """A ball in a bowl: normals, what is covered, curvature, and friction across the planes."""
+    last = 1 if cell == "quadrilateral" else 2
+    planes = [f"{body} {side}" for body in ("lower", "upper") for side in ("left", "front")[:last]]
+
+    def answer(parts):
+        def at(x):
+            return 0.5 * x + 0.25 if parts == 1 else x
+
+        d = bent(cell, 3 * parts, 4 * parts, 0.9, 1.0, at, 0.01)
+        d.mesh.geometry.x[:, :last] = at(d.mesh.geometry.x[:, :last] - 0.5)
+        bcs = held(d, *planes[len(planes) * (parts - 1) :], "lower bottom", ("upper top", -0.04))
+        pair = sided(*sides, gap=gap, friction=tfeti.Coulomb(0.3), reach=0.3)
+        p = solved(two_body_problem(d, no_load, bcs, [pair], degree, rtol=1e-9))
+        data = p.solution.contact()
+        both = displacement(p), by_point(d.comm, data.points, data.pressure)
+        return [values[np.all(x[:, :last] > -1e-9, axis=1)] for x, values in both]
+
+    for part, of_whole in zip(answer(1), answer(2), strict=True):
+        assert apart(part, of_whole) < 1e-4
+
+
+def test_a_slant_that_begins_at_a_guide_keeps_its_normal():
+    """The mirror image would have an edge there."""
+    d = shaped("quadrilateral", 3, 4, *[lambda x: 0.2 * x[:, 0]] * 2)
+    bcs = held(d, "lower left", "upper left", "lower bottom", ("upper top", -0.04))
+    normal = (
+        solved(two_body_problem(d, no_load, bcs, [sided(*ORDERS[0])])).solution.contact().normal
+    )
+    assert np.allclose(normal, np.array([0.2, -1.0]) / np.hypot(0.2, 1.0))
 
 
 def against_lame(p):

@@ -10,7 +10,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.constraints.gluing import glue
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.records import slips
-from tfeti_dolfinx.forms.dirichlet import prescribe
+from tfeti_dolfinx.forms.dirichlet import EndPlanes, prescribe
 from tfeti_dolfinx.mortar.facets import group_points
 
 TRESCA, COULOMB = tfeti.Tresca(0.1), tfeti.Coulomb(0.3)
@@ -96,10 +96,15 @@ def test_no_friction_across_a_plane_of_symmetry(cell, counts):
     """
     d = stacked(cell, *counts, 6)
     dofs = dofs_on(d)
-    records = searched([sided("upper bottom", "lower top", friction=COULOMB)], dofs)
+    records, ends = (
+        searched([sided("upper bottom", "lower top", friction=COULOMB)], dofs),
+        EndPlanes(dofs),
+    )
     upper, lower = (roller(dofs.V, 1, d.facets(f"{name} front")) for name in ("upper", "lower"))
     for bcs, kept in (([upper, lower], False), ([upper], True), ([lower], True)):
-        gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, weights_of(dofs))
+        given = prescribe(dofs, bcs, ends)
+        assert (given.across is None) == kept
+        gluing = glue(dofs, given, records, 1.0, weights_of(dofs))
         rows = gluing.tangents
         on_plane = np.abs(group_points(dofs)[records.group[rows.condition], 1]) < 1e-9
         assert d.comm.allreduce(int(on_plane.sum())) > 2
@@ -107,6 +112,8 @@ def test_no_friction_across_a_plane_of_symmetry(cell, counts):
         assert np.all(rows.moves[along_y & on_plane[:, None]] == kept)
         assert np.all(rows.moves[~along_y | ~on_plane[:, None]])
         gluing.constraints.B.destroy()
+    drawn = roller(dofs.V, 1, d.facets("lower front"), 0.125)
+    assert prescribe(dofs, [upper, drawn], ends).across is None
 
 
 def test_prescribed_values_slip():

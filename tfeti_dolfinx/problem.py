@@ -32,7 +32,7 @@ from tfeti_dolfinx.forms.checks import (
     displacement_space,
     is_axisymmetric,
 )
-from tfeti_dolfinx.forms.dirichlet import Prescribed, check_conditions, listed_conditions
+from tfeti_dolfinx.forms.dirichlet import check_conditions, listed_conditions
 from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -539,7 +539,8 @@ class ContactProblem:
         state = state.on_rows(system.gluing)
         # what conditions prescribed then: by now they may have other values
         values = self.dofs.reduce(state.u.reshape(-1, self.dofs.bs), np.maximum)
-        held = Prescribed(flag := system.gluing.prescribed.flag, np.where(flag, values, 0.0))
+        held = system.gluing.prescribed
+        held = replace(held, value=np.where(held.flag, values, 0.0))
         gluing = replace(system.gluing, slip=state.slip, prescribed=held)
         dual.learn()
         if dual.recycled is not None:

@@ -28,7 +28,7 @@ from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.dual import Dual, contact_set
 from tfeti_dolfinx.forms.assembly import Data, Forms
-from tfeti_dolfinx.forms.dirichlet import Prescribed, prescribe
+from tfeti_dolfinx.forms.dirichlet import EndPlanes, Prescribed, prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
@@ -85,6 +85,11 @@ class System(Generic[OwnForms]):
         self._dofs, self._settings = dofs, settings
         self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)
+        # obstacles have normals of their own, and of degree 1 nodes see no others
+        pairs = any(isinstance(contact, Contact) for contact in contacts)
+        self._sees_symmetry = dofs.bs == dofs.V.mesh.geometry.dim and (
+            pairs or (self._has_friction and dofs.V.element.basix_element.degree > 1)
+        )
         self.elements = (
             FiniteElements(dofs) if method is None else method.assembly(dofs, dofs.decomposition)
         )
@@ -104,6 +109,7 @@ class System(Generic[OwnForms]):
         self._known_rows: KnownRows | None = None
         self.known_friction: Array | None = None
         self._prescribed: Prescribed | None = None
+        self._ends: EndPlanes | None = None
         self._conditions: list[fem.DirichletBC] | None = None  # that it is of, with their values
         self._values = Data(
             lambda: [bc.g.x.array if hasattr(bc.g, "x") else bc.g.value for bc in self.bcs],
@@ -144,15 +150,19 @@ class System(Generic[OwnForms]):
         for what in (name for name in CHANGES if name in changes):
             self.change(what)
         comm, given = self._dofs.comm, list(self.bcs)
-        if self._values.has_changed() or given != self._conditions:
+        if "points" in changes:
+            self._ends = None
+        if self._ends is None and given and self._sees_symmetry:
+            self._ends = EndPlanes(self._dofs)
+        if self._values.has_changed() or given != self._conditions or "points" in changes:
             self._conditions, old = None, self._prescribed  # what raises looks again
-            new = self._prescribed = prescribe(self._dofs, given)
+            new = self._prescribed = prescribe(self._dofs, given, self._ends)
             if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
                 self.change("constraints")
-                if old and self._search and self._search.sees(new.flag != old.flag):
-                    self.change("places")
             elif any_rank(comm, not np.array_equal(new.value, old.value)):
                 self.change("right side")
+            if old and self._search and self._search.sees(new.kinds != old.kinds):
+                self.change("places")
             self._conditions = given
         if self._search is not None and self.known_friction is not None:
             known, friction = self.known_friction, self._search.friction()
@@ -290,7 +300,7 @@ class System(Generic[OwnForms]):
         decided = before is not None or self._known_rows is not None
         stiffness = None if decided else self._blocks
         self._search = ContactSearch(
-            contacts, dofs, stiffness, self.origin, tools, made(self._prescribed).flag
+            contacts, dofs, stiffness, self.origin, tools, made(self._prescribed)
         )
         if before is None:
             tools.check_begin(contacts, self._search.records)

@@ -9,6 +9,7 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.rows import TOLERANCES, Rows, stack
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.contact.tools import RigidEntries
+from tfeti_dolfinx.forms.dirichlet import Prescribed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -17,14 +18,13 @@ class RowBuilder:
 
     A coefficient a becomes a·w/Σw on each torn copy, w its weight in D (a/k on k copies of equal
     weight): so rows are orthogonal to the gluing rows in the inner product of D⁻¹. Prescribed
-    components are left to the right side. D and flags of prescribed components are those of copies
-    and of owned groups, shapes ``(c, bs)`` and ``(g, bs)``.
+    components are left to the right side. D is that of copies, shape ``(c, bs)``.
     """
 
     def __init__(
         self,
         dofs: TornDofs,
-        flag: Array,
+        prescribed: Prescribed,
         weights: Array,
         records: ContactRecords,
         rigid: RigidEntries | None = None,
@@ -33,7 +33,12 @@ class RowBuilder:
         self._rigid = rigid or RigidEntries(none, none, np.zeros((0, dofs.bs)))
         sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
         self.records, self._dofs, self._weights = records, dofs, weights
-        self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
+        self._prescribed, self._total = dofs.lookup(records.entry_group, prescribed.flag, sums)
+        # tangents across a plane of symmetry, where nothing slips, shape (n, gdim - 1)
+        self.across = np.zeros(records.tangents.shape[:2], dtype=bool)
+        if prescribed.across is not None:
+            along = np.abs(records.tangents) * prescribed.across[records.group][:, None]
+            self.across = np.any(along > 1.0 - TOLERANCES.nothing_left, axis=2)
 
     def left(self, axis: int) -> tuple[Array, Array, Array]:
         """Squared norms in D⁻¹ without prescribed components; whether they exceed rounding.
@@ -155,7 +160,7 @@ def tangent_rows(
         return Rows(none, none, none, number), TangentRows(none, number, moves, none, moves)
     of_axes = [builder.left(1 + k) for k in range(count)]
     squares, left, share = np.array(of_axes).transpose(1, 2, 0)
-    left = left * (share > TOLERANCES.little_left)
+    left = left * (share > TOLERANCES.little_left) * ~builder.across
     of_normal, row = np.zeros(len(records)), np.full(len(records), -1)
     of_normal[normals.condition] = normals.scale
     row[normals.condition] = np.arange(len(normals.condition))

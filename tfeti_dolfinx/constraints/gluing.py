@@ -186,7 +186,7 @@ class Gluing:
             slip = np.where(self._forced(), begin[1], begin[0])
         gluing = replace(
             self,
-            prescribed=Prescribed(flag, np.where(flag, values, 0.0)),
+            prescribed=replace(self.prescribed, value=np.where(flag, values, 0.0)),
             records=replace(self.records, gap=gaps),
             slip=slip,
         )
@@ -260,7 +260,7 @@ def glue(
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
     rigid = tools.entries(records) if tools else None
-    builder = RowBuilder(dofs, prescribed.flag, D, records, rigid)
+    builder = RowBuilder(dofs, prescribed, D, records, rigid)
     normal_rows, contact = contact_rows(builder)
     if tools and rigid:
         decided = np.intersect1d(contact.decided, rigid.condition)

@@ -20,6 +20,7 @@ from tfeti_dolfinx.contact.records import ContactRecords, Side, conditions, rela
 from tfeti_dolfinx.contact.rigid_body import Law, RigidBody
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.forms.dirichlet import Prescribed
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
@@ -31,6 +32,7 @@ from tfeti_dolfinx.mortar.facets import (
     local_facets,
     surface_facets,
     with_averaged_normals,
+    with_images,
 )
 from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_curvature
 from tfeti_dolfinx.mortar.multipliers import with_held_vertices
@@ -40,7 +42,7 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 Gap: TypeAlias = str | float | Callable[[Array], ArrayLike]
 # what the geometry has for a gap: the distance of facets, or of the smooth surfaces through them
 GEOMETRY, CURVED = "geometry", "curved"
-Flag: TypeAlias = Array | None  # whether components of owned groups are prescribed, (g, bs)
+Held: TypeAlias = Prescribed | None  # what Dirichlet conditions prescribe; None: nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +70,7 @@ class ContactPartner(ABC):
 
     @abstractmethod
     def records(
-        self, dofs: TornDofs, contact: int, reach: float, depth: float, flag: Flag = None
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Held = None
     ) -> ContactRecords:
         """Return the conditions; raise an InputError where a surface, shape, gap or law is unfit.
 
@@ -93,7 +95,7 @@ class ContactPartner(ABC):
 
     @abstractmethod
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, flag: Flag = None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Held = None
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact with its sides decided, and its conditions up to a reach, and so deep.
 
@@ -250,7 +252,7 @@ class Obstacle(ContactPartner):
         return (self.surface,)
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, flag: Flag = None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Held = None
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact and its conditions. Collective.
 
@@ -259,7 +261,7 @@ class Obstacle(ContactPartner):
         facets = self._facets(dofs)
         if stiffness is not None and dofs.bs > 1:  # else the gradient's first component counts
             self._check_shape(dofs, facets)
-        return self, self._conditions(dofs, contact, facets, reach, flag)
+        return self, self._conditions(dofs, contact, facets, reach, held)
 
     def _facets(self, dofs: TornDofs) -> Facets:
         """Return the facets of the surface on this rank."""
@@ -278,13 +280,13 @@ class Obstacle(ContactPartner):
             )
 
     def records(
-        self, dofs: TornDofs, contact: int, reach: float, depth: float, flag: Flag = None
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Held = None
     ) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective."""
-        return self._conditions(dofs, contact, self._facets(dofs), reach, flag)
+        return self._conditions(dofs, contact, self._facets(dofs), reach, held)
 
     def _conditions(
-        self, dofs: TornDofs, contact: int, facets: Facets, reach: float, flag: Flag
+        self, dofs: TornDofs, contact: int, facets: Facets, reach: float, held: Held
     ) -> ContactRecords:
         """One condition per vertex of these facets. Collective.
 
@@ -304,7 +306,7 @@ class Obstacle(ContactPartner):
         length = np.linalg.norm(sides, axis=1, keepdims=True)
         normals = np.where(length > 0.0, sides / np.where(length > 0.0, length, 1.0), normals)
         if not (isinstance(self.shape, RigidBody) and self.shape.free):
-            facets = with_held_vertices(facets, dofs, normals, flag)
+            facets = with_held_vertices(facets, dofs, normals, held.flag if held else None)
         side = Side(facets, hat_areas(kind, facets), normals)
         integrals = integrate_distance(kind, facets, distance.reshape(facets.vertices.shape))
         found = conditions(dofs, contact, side, integrals)
@@ -416,7 +418,7 @@ class Contact(ContactPartner):
         return min(reach, diameter(decomposition))
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, flag: Flag = None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Held = None
     ) -> tuple[Contact, ContactRecords]:
         """Return the contact with its secondary side as ``a``, and its conditions. Collective.
 
@@ -427,8 +429,8 @@ class Contact(ContactPartner):
         """
         cite("mortar")
         settled = self._named_first(dofs.decomposition)
-        sides = settled._sides(dofs, flag)
-        found = settled._meet(sides, dofs, contact, reach, reach)
+        sides = settled._sides(dofs, held)
+        found = settled._meet(sides, dofs, contact, reach, reach, held)
         if stiffness is None:
             return settled, found
         size, per_area = _ratios(found, sides, dofs, stiffness)
@@ -438,7 +440,7 @@ class Contact(ContactPartner):
         auto, finite = self.secondary == "auto", dofs.nodes is not None
         little = not _is_believed(found, dofs)
         if little or worse or (auto and (exchange or finite)):
-            other = settled._meet(sides[::-1], dofs, contact, reach, reach)
+            other = settled._meet(sides[::-1], dofs, contact, reach, reach, held)
             useful = _is_believed(other, dofs)  # `little` is so of the other side, too, or not
             better = useful if useful == little else _is_better(other, found, dofs, exchange)
             if better and auto:
@@ -456,14 +458,14 @@ class Contact(ContactPartner):
         return settled, found
 
     def records(
-        self, dofs: TornDofs, contact: int, reach: float, depth: float, flag: Flag = None
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Held = None
     ) -> ContactRecords:
         """One condition per node of ``a`` opposite to ``b``. Collective.
 
         With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is
         n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i.
         """
-        return self._meet(self._sides(dofs, flag), dofs, contact, reach, depth)
+        return self._meet(self._sides(dofs, held), dofs, contact, reach, depth, held)
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
         """Return gaps of its conditions; those of the geometry may not overlap too deep."""
@@ -476,7 +478,7 @@ class Contact(ContactPartner):
             )
         return found
 
-    def _sides(self, dofs: TornDofs, flag: Flag) -> tuple[Side, Side]:
+    def _sides(self, dofs: TornDofs, held: Held) -> tuple[Side, Side]:
         """Facets of both surfaces, with averaged normals and curvature."""
         gdim = dofs.V.mesh.geometry.dim
         if dofs.bs != gdim:
@@ -484,26 +486,33 @@ class Contact(ContactPartner):
                 f"{self.name}: the space is scalar; expected displacements of {gdim} components, "
                 "since surfaces meet along normals"
             )
-        sides, kind = [], facet_kind(dofs)
+        sides, kind, across = [], facet_kind(dofs), _across(dofs, held)
         for surface in self.surfaces:
             facets = local_facets(dofs, dofs.decomposition.facets(surface), kind)
             whole = facets.radius ** (dofs.bs - 1)
             if count := count_over(dofs.comm, facets.area <= SEARCH.degenerate * whole):
                 raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")
-            facets, normals = with_averaged_normals(facets, dofs)
-            facets = with_curvature(facets, dofs, kind)
-            facets = with_held_vertices(facets, dofs, normals, flag)
+            facets, normals = with_averaged_normals(facets, dofs, across)
+            facets = with_curvature(facets, dofs, kind, across)
+            facets = with_held_vertices(facets, dofs, normals, held.flag if held else None)
             sides.append(Side(facets, hat_areas(kind, facets), normals))
         return sides[0], sides[1]
 
     def _meet(
-        self, sides: tuple[Side, Side], dofs: TornDofs, contact: int, reach: float, depth: float
+        self,
+        sides: tuple[Side, Side],
+        dofs: TornDofs,
+        contact: int,
+        reach: float,
+        depth: float,
+        held: Held,
     ) -> ContactRecords:
         """Return conditions from integrals over the first side's facets that face the second."""
         kind, comm = facet_kind(dofs), dofs.comm
         height, deep = SEARCH.seen * reach, SEARCH.seen * depth
         distance = max(height, deep)
-        secondary, primary = rendezvous(sides[0].facets, sides[1].facets, distance, comm)
+        facing = with_images(sides[1].facets, dofs, _across(dofs, held))
+        secondary, primary = rendezvous(sides[0].facets, facing, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
@@ -529,6 +538,15 @@ class Contact(ContactPartner):
                 f'{self.name}: secondary={self.secondary!r}, expected one of its surfaces or "auto"'
             ) from None
         return replace(self, a=self.b, b=self.a) if named else self
+
+
+def _across(dofs: TornDofs, held: Held) -> Array | None:
+    """Return flags of components across planes of symmetry; None in finite strain.
+
+    There Newton's method does not follow normals that turn where a surface begins or ceases to
+    bend towards the plane.
+    """
+    return held.across if held and dofs.nodes is None else None
 
 
 def _is_believed(records: ContactRecords, dofs: TornDofs) -> bool:

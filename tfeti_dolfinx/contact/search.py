@@ -13,6 +13,7 @@ from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
 from tfeti_dolfinx.contact.tools import Tools
+from tfeti_dolfinx.forms.dirichlet import Prescribed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -30,8 +31,8 @@ class ContactSearch:
     K of each primal node, shape ``(num_nodes, bs, bs)``; without it sides are decided. ``origin``
     has the displacements in primal order at which nodes and facets are, by default 0: gaps are
     those of the total one. Obstacles meet nodes, pairs facets, which a mesh of degree 1 has
-    straight where u is of degree 2. Tools are where they are placed. ``flag`` says which
-    components of owned groups are prescribed, shape ``(g, bs)``; None: none.
+    straight where u is of degree 2. Tools are where they are placed. Without ``prescribed``
+    no component is.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
@@ -46,9 +47,9 @@ class ContactSearch:
         stiffness: Array | None,
         origin: Array | None = None,
         tools: Tools | None = None,
-        flag: Array | None = None,
+        prescribed: Prescribed | None = None,
     ) -> None:
-        self._tools, self._flag = tools, flag
+        self._tools, self._prescribed = tools, prescribed
         self._dofs, self._origin, decomposition = dofs, origin, dofs.decomposition
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
@@ -56,7 +57,7 @@ class ContactSearch:
         self._reach = list(self._depths)
         check_together(contacts, decomposition)
         settled = [
-            contact.settled(dofs, i, self._reach[i], stiffness, flag)
+            contact.settled(dofs, i, self._reach[i], stiffness, prescribed)
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
@@ -88,6 +89,8 @@ class ContactSearch:
         On surfaces of a pair, and of degree above 1 on that of an obstacle.
         """
         dofs = self._dofs
+        if not any_rank(dofs.comm, changed):
+            return False
         bends = dofs.V.element.basix_element.degree > 1
         found = [nodes for both in self._nodes if bends or len(both) > 1 for nodes in both]
         groups = dofs.group[np.concatenate([np.empty(0, dtype=np.int64), *found])]
@@ -205,7 +208,7 @@ class ContactSearch:
     def _search(self, i: int, reach: float) -> ContactRecords:
         """Conditions up to a larger reach, of which those have rows that had them before."""
         known = self._records[i]
-        found = self.contacts[i].records(self._dofs, i, reach, self._depths[i], self._flag)
+        found = self.contacts[i].records(self._dofs, i, reach, self._depths[i], self._prescribed)
         had_rows = np.isin(found.group, known.group[known.within_reach])
         return replace(self._from_origin(i, found), within_reach=had_rows)
 

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import space_of
+from tfeti_dolfinx.common.parallel import box_over_ranks, summed
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
@@ -53,12 +55,63 @@ class Prescribed:
 
     flag: Array  # whether a component is prescribed, shape (g, bs)
     value: Array  # its value, 0 where it is not, shape (g, bs)
+    across: Array | None = None  # whether it is across a plane of symmetry, (g, bs); None: none is
+
+    @property
+    def kinds(self) -> Array:
+        """0 for a component that is free, 1 if prescribed, 3 if across a plane of symmetry."""
+        return self.flag + (0 if self.across is None else 2 * self.across)
+
+
+class EndPlanes:
+    """Planes x_k = c at which the whole mesh ends, and ends in facets: maybe planes of symmetry.
+
+    Creation is collective. Under axisymmetry x_0 = 0 is the only one across r. What is within
+    ``near``, over the mesh's extent, lies in a plane.
+    """
+
+    def __init__(self, dofs: TornDofs, near: float = 1e-9) -> None:
+        self._comm, gdim = dofs.comm, dofs.V.mesh.geometry.dim
+        x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
+        low, high = box_over_ranks(dofs.comm, x)
+        near *= np.max(high - low)
+        at = np.abs(x[:, None] - np.stack((low, high))) <= near  # both ends, shape (n, 2, gdim)
+        if dofs.axisymmetric:
+            at[np.abs(x[:, 0]) > near, :, 0] = False
+        facets, flat = dofs.facet_nodes(dofs.decomposition.boundary), np.zeros_like(at)
+        np.logical_or.at(flat, facets, at[facets].all(axis=1)[:, None])
+        # of owned groups, shape (g, 2, gdim)
+        self._on, flat = dofs.reduce(np.stack((at, flat), axis=1), np.logical_or).swapaxes(0, 1)
+        self._on &= summed(dofs.comm, np.sum(self._on & ~flat, axis=0)) == 0
+
+    def across(self, flag: Array, value: Array, agreement: float) -> Array | None:
+        """Return flags of components across planes of symmetry, ``(g, gdim)``; None: none is one.
+
+        These are all of whose nodes have u_k prescribed, and alike: the mirror image moves along.
+        Values that differ by less than ``agreement``, relative, are the same. Collective.
+        """
+        on, value = self._on, value[:, None]
+        free, there = np.any(on & ~flag[:, None], axis=0), np.any(on, axis=0)
+        most, least = (
+            np.where(on, values, -np.inf).max(axis=0, initial=-np.inf) for values in (value, -value)
+        )
+        found = np.array([free, there, most, least])
+        self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+        free, there, most, least = found
+        alike = most + least <= agreement * np.maximum(np.abs(most), np.abs(least))
+        planes = (free == 0.0) & (there > 0.0) & alike
+        return np.any(on & planes, axis=1) if np.any(planes) else None
 
 
 def prescribe(
-    dofs: TornDofs, bcs: Sequence[fem.DirichletBC], agreement: float = 1e-10
+    dofs: TornDofs,
+    bcs: Sequence[fem.DirichletBC],
+    ends: EndPlanes | None = None,
+    agreement: float = 1e-10,
 ) -> Prescribed:
     """Collect Dirichlet values of all copies of nodes. Collective.
+
+    Planes of symmetry are looked for among ``ends``.
 
     Raise an InputError where a value is not finite, or values at a node differ by more than
     ``agreement``, relative to the largest.
@@ -86,7 +139,8 @@ def prescribe(
                 f"prescribed as {low[at]} and as {high[at]} "
                 f"(at {wrong.sum()} components of nodes on this rank)"
             )
-    return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
+    value = np.where(flag, low, 0.0)
+    return Prescribed(flag, value, ends.across(flag, value, agreement) if ends else None)
 
 
 def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:

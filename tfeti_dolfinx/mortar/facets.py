@@ -163,15 +163,57 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     )
 
 
-def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array]:
+def with_averaged_normals(
+    facets: Facets, dofs: TornDofs, across: Array | None
+) -> tuple[Facets, Array]:
     """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
-    Return the averaged normal of each owned group, too, 0 off them, shape ``(g, gdim)``.
+    On a plane of symmetry they lie in it, as those of the whole surface, unless that has an edge
+    there: where the next vertices' normals are turned by no more. ``across`` has flags of owned
+    groups' components, shape ``(g, gdim)``; None: there is none. Return the averaged normal of each
+    owned group, too, 0 off them, shape ``(g, gdim)``.
     """
     groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
     averaged = unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
+    if across is not None:
+        (turned,) = dofs.lookup(groups, np.where(across, 0.0, np.abs(averaged)))
+        most = turned.reshape(weighted.shape).max(axis=1, keepdims=True)
+        turned = np.broadcast_to(most, weighted.shape).reshape(turned.shape)
+        turned = dofs.reduce_on_owners(groups, turned, np.maximum)
+        bends = turned > SEARCH.bends * np.abs(averaged)
+        averaged = unit(np.where(across & bends, 0.0, averaged))
     (at_vertices,) = dofs.lookup(groups, averaged)
     return replace(facets, vertex_normals=at_vertices.reshape(weighted.shape)), averaged
+
+
+def with_images(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:
+    """Return facets with mirror images of those at planes of symmetry. Collective.
+
+    Images have the nodes of what they mirror: u_k is 0 on the plane, and hardly more beside it.
+    """
+    if across is None:
+        return facets
+    (at,) = dofs.lookup(facets.vertices.ravel(), across)
+    at = at.reshape(*facets.vertices.shape, dofs.bs)
+    for k in range(dofs.bs):
+        of = np.flatnonzero(at[:, :, k].any(axis=1) & ~at[:, :, k].all(axis=1))
+        if not len(of):
+            continue
+        sign = np.where(np.arange(dofs.bs) == k, -1.0, 1.0)
+        offset = 2.0 * facets.x[of, np.argmax(at[of, :, k], axis=1), k]
+        image = Facets(*(getattr(facets, f.name)[of] for f in fields(facets)))
+        x = sign * image.x
+        x[:, :, k] += offset[:, None]
+        image = replace(
+            image,
+            x=x,
+            normal=sign * image.normal,
+            vertex_normals=sign * image.vertex_normals,
+            curvature=sign * image.curvature * sign[:, None],
+        )
+        both = ((getattr(facets, f.name), getattr(image, f.name)) for f in fields(facets))
+        facets, at = Facets(*map(np.concatenate, both)), np.concatenate((at, at[of]))
+    return facets
 
 
 def _normals(element: FacetElement, x: Array, xi: Array) -> Array:

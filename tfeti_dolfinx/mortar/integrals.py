@@ -25,15 +25,16 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 # --- The smooth surface that straight facets stand for ----------------------------------------
 
 
-def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
+def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind, across: Array | None) -> Facets:
     """The same facets with the curvature of a smooth surface through their vertices. Collective.
 
     At each vertex the heights of its neighbours over its tangent plane are fitted by z = a·t + ½
     tᵀKt, a the error of the averaged normal, by least squares of what each neighbour says of the
     curvature. What remains of the normal equations without a is added up over the vertices of a
     facet, so that a vertex at the rim, whose neighbours lie to one side, leaves to the others what
-    it does not know. Vertices at edges say nothing. Facets whose geometry has a higher degree are
-    curved themselves, and stay as they are.
+    it does not know. Vertices at edges say nothing; those on planes of symmetry, by flags
+    ``across`` of owned groups' components, have mirrored neighbours, too. Facets whose geometry has
+    a higher degree are curved themselves, and stay as they are.
     """
     normals, groups = facets.vertex_normals, facets.vertices.ravel()
     cosine = np.einsum("nvg,ng->nv", normals, facets.normal)
@@ -43,6 +44,9 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
     n, v, gdim = normals.shape
     axes = tangents(normals.reshape(-1, gdim)).reshape(n, v, gdim - 1, gdim)
     M, b = _normal_equations(facets.corners, normals, axes)
+    if across is not None:
+        (at,) = dofs.lookup(groups, across)
+        M, b = _mirrored(M, b, axes, at.reshape(n, v, gdim))
     sharp = (cosine <= SEARCH.edge).astype(float)
     exchange, asked = dofs.owners_of(groups)
     vertex, place = np.unique(asked, return_inverse=True)
@@ -90,6 +94,19 @@ def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Arr
     rows = np.concatenate((u * inverse[..., None], np.stack(terms, axis=-1)), axis=3)
     height = np.einsum("nvwg,nvg->nvw", d, normals) * inverse**2
     return rows.swapaxes(2, 3) @ rows, np.einsum("nvwi,nvw->nvi", rows, height)
+
+
+def _mirrored(M: Array, b: Array, axes: Array, across: Array) -> tuple[Array, Array]:
+    """Return normal equations with those of mirrored neighbours, by flags, ``(n, v, gdim)``."""
+    pairs = list(combinations_with_replacement(range(axes.shape[2]), 2))
+    for k in range(across.shape[2]):
+        at = across[:, :, k, None]
+        sign = np.where(at & (np.abs(axes[..., k]) > 0.5), -1.0, 1.0)
+        products = [sign[..., i] * sign[..., j] for i, j in pairs]
+        sign = np.concatenate((sign, np.stack(products, axis=-1)), axis=2)
+        M = M + at[..., None] * sign[..., None] * M * sign[:, :, None]
+        b = b + at * sign * b
+    return M, b
 
 
 def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:

@@ -13,6 +13,9 @@ class SearchTolerances:
     # cosine of 20°: facets that turn by twice that at a vertex have an edge there, others are those
     # of a smooth surface, with nine facets or more around a pin
     edge: float = 0.94
+    # how much farther a normal is turned beside a plane of symmetry than on it, where the surface
+    # bends towards it: twice on an arc of equal facets, 1 on a plane that meets it at a slant
+    bends: float = 1.2
     at_edge: float = 1e-3  # of a facet's radius: a vertex so near an edge of a shape lies on it
     # of a cosine: facets that turn by less are parts of a plane
     turned: float = 8.0 * EPSILON
