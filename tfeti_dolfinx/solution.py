@@ -136,7 +136,7 @@ class Solution:
 
         Args:
             points: The same on all ranks, shape ``(k, gdim)``. On the surface of boundary elements
-                the displacement is that of their nodes, and the stress that of a point next to it.
+                the displacement is that of the nodes, and the stress the mean of points next to it.
 
         Raises:
             InputError: The points are of another shape, or not finite.

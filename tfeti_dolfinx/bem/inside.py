@@ -31,7 +31,7 @@ class EvaluationParameters:
         on: Of the size of the body: so far from its box a point may be and on its surface.
         sure: Share of directions hidden by a body that is neither 0 nor 1 to this: points on its
             surface.
-        beside: Their stress is taken so far on the way to the middle of their cell.
+        beside: Their stress is taken so far on the way to the middles of their cells.
     """
 
     far: float = 2.0
@@ -316,12 +316,12 @@ class BoundarySolution:
             sigma = body.inside.stress(points[own]) / thickness
             total[own] += value_row(body.inside.displacement(points[own]), sigma)
             on = (share > PARAMETERS.sure) & (share <= 1.0 - PARAMETERS.sure)
-            there = np.flatnonzero(on[place] & (owner[cells] == body.subdomain))
-            if len(there):
-                own, first = np.unique(place[there], return_index=True)
-                cell, at = cells[there[first]], points[own]
+            there = on[place] & (owner[cells] == body.subdomain)
+            if np.any(there):  # the mean of the cells that meet there, whatever their order
+                own, cell = place[there], cells[there]
+                at = points[own]
                 middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=1)[:, :d]
                 sigma = body.inside.stress(at + PARAMETERS.beside * (middle - at)) / thickness
                 x = np.pad(at, ((0, 0), (0, 3 - d)))
-                total[own] += value_row(u.eval(x, cell).reshape(-1, d), sigma)
+                np.add.at(total, own, value_row(u.eval(x, cell).reshape(-1, d), sigma))
         return total
