@@ -148,8 +148,7 @@ def scene(
     """A box on a box, n = (cells of the lower, of the upper); the upper one is stiffer."""
     d = stacked(cell, *n, subdomains)
     stress, bcs = stiffer_above(d, stiffness), held(d, *sides_of(cell))
-    p = solved(two_body_problem(d, pressed(d), bcs, [contact], degree, stress=stress, **options))
-    return p
+    return solved(two_body_problem(d, pressed(d), bcs, [contact], degree, stress=stress, **options))
 
 
 @pytest.mark.parametrize("sides", [(UPPER, LOWER), (LOWER, UPPER)])
@@ -207,9 +206,8 @@ def below(distance, **changes):
 @pytest.mark.parametrize("distance", [0.1, 1e6])
 def test_an_obstacle_that_is_never_touched_changes_nothing(distance):
     d = decomposed("quadrilateral", 6)
-    without, with_it = (problem(d, (0.0, -1e-3), some) for some in ([], [below(distance)]))
-    without.solve()
-    with_it.solve()
+    both = ([], [below(distance)])
+    without, with_it = (solved(problem(d, (0.0, -1e-3), contacts)) for contacts in both)
     assert with_it.report.contact_rows == 0
     assert with_it.report.F_multiplications == without.report.F_multiplications
     assert relative(displacement(with_it)[1], displacement(without)[1]) <= 1e-12
@@ -245,9 +243,8 @@ def test_who_meets_nobody_is_said(caplog):
 def test_the_reach_does_not_change_the_answer(reach):
     """Of a plane that the load closes."""
     d = decomposed("quadrilateral", 8)
-    found = [problem(d, (0.0, -0.05), [below(0.02, reach=one)], rtol=1e-10) for one in (reach, 1.0)]
-    for p in found:
-        p.solve()
+    floors = [[below(0.02, reach=one)] for one in (reach, 1.0)]
+    found = [solved(problem(d, (0.0, -0.05), floor, rtol=1e-10)) for floor in floors]
     assert (found[0].report.late_contact_rows > 0) == (reach == 1e-3)
     assert 0 < found[0].report.active_contacts == found[1].report.active_contacts
     assert relative(*(displacement(p)[1] for p in found)) <= 1e-7
@@ -260,9 +257,8 @@ def test_a_punch_from_afar_presses_by_little(rtol):
     sides = ["lower bottom", "lower left", ("upper top", -0.3005), "upper left"]
     forces = []
     for one in (rtol, 1e-10):
-        p = solved(
-            two_body_problem(d, pressed(d, 0.0), held(d, *sides), [sided(UPPER, LOWER)], rtol=one)
-        )
+        given = pressed(d, 0.0), held(d, *sides), [sided(UPPER, LOWER)]
+        p = solved(two_body_problem(d, *given, rtol=one))
         forces.append(p.solution.contact(0).resultant.force[1])
     assert forces[1] > 1e-4
     assert forces[0] == pytest.approx(forces[1], rel=rtol)

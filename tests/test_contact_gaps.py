@@ -92,9 +92,8 @@ def test_an_overhanging_wedge(cell, slope):
     """
     n, gdim = 4, 2 if cell in CELLS[:2] else 3
     start = 0.5 if slope < 0.0 else -0.5
-    d = shaped(
-        cell, 3, n, lambda x: 0.0 * x[:, 0], lambda x: slope * (x[:, 0] - start), across=(0.0, 1.15)
-    )
+    sides = (lambda x: 0.0 * x[:, 0]), (lambda x: slope * (x[:, 0] - start))
+    d = shaped(cell, 3, n, *sides, across=(0.0, 1.15))
     dofs = dofs_on(d)
     records = searched([sided(*ORDERS[0], reach=0.5)], dofs)
     x = gathered(group_points(dofs)[records.group])[:, 0] - 0.5
@@ -137,10 +136,9 @@ def test_a_slant_that_begins_at_a_guide_keeps_its_normal():
     """The mirror image would have an edge there."""
     d = shaped("quadrilateral", 3, 4, *[lambda x: 0.2 * x[:, 0]] * 2)
     bcs = held(d, "lower left", "upper left", "lower bottom", ("upper top", -0.04))
-    normal = (
-        solved(two_body_problem(d, no_load, bcs, [sided(*ORDERS[0])])).solution.contact().normal
-    )
-    assert np.allclose(normal, np.array([0.2, -1.0]) / np.hypot(0.2, 1.0))
+    p = solved(two_body_problem(d, no_load, bcs, [sided(*ORDERS[0])]))
+    normal = np.array([0.2, -1.0]) / np.hypot(0.2, 1.0)
+    assert np.allclose(p.solution.contact().normal, normal)
 
 
 def against_lame(p):

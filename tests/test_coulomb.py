@@ -146,9 +146,8 @@ def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(
         push.value[0] = 0.125 * (low + share * (high - low))
         plane = tfeti.Plane((0, 0), normal=(-s, c))
         floor = tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(mu))
-        problem = problem or tfeti.ContactProblem(
-            elastic.a(u, v), ufl.inner(push, v) * ufl.dx, [], [floor], d, petsc_options=options
-        )
+        given = elastic.a(u, v), ufl.inner(push, v) * ufl.dx, [], [floor], d
+        problem = problem or tfeti.ContactProblem(*given, petsc_options=options)
         problem.solve()
         return problem
 
@@ -166,10 +165,8 @@ def test_the_body_that_slides_without_end_is_named():
     d = torn_boxes("quadrilateral", parts, 4)
     planes = {"still bottom": ((0, 0), (0, 1)), "loose left": ((2, 0), (1, 0))}
     planes["loose right"], law = ((3, 0), (-1, 0)), tfeti.Coulomb(0.5)
-    contacts = [
-        tfeti.Obstacle(side, tfeti.Plane(*plane), friction=law, reach=np.inf)
-        for side, plane in planes.items()
-    ]
+    given = {"friction": law, "reach": np.inf}
+    contacts = [tfeti.Obstacle(on, tfeti.Plane(*plane), **given) for on, plane in planes.items()]
     tops = d.surface("still top"), d.surface("loose top")
     p = two_body_problem(d, lambda v, ds: -0.05 * v[1] * ds(tops), clamped(d), contacts)
     said = r"body \d is free to move \(translation in y\) without end on contact 1: .* 2: .* gap"
@@ -181,12 +178,12 @@ def test_a_ring_is_turned_in_its_fit_as_far_as_friction_holds(comm):
     """Above that it would wedge at 180 radians, as nodes are spaced unevenly by 1e-4."""
     d = rings([((0, 0), r, r + 0.5, 2, 24, 1e-4, seed) for r, seed in ((0.5, 1), (1.0, 2))], 3)
     twist, (x, y) = fem.Constant(d.mesh, 1e-3), ufl.SpatialCoordinate(d.mesh)
-    p = two_body_problem(
-        d,
-        lambda v, ds: twist * (x * v[1] - y * v[0]) * ds(d.surface("in0")),
-        clamped(d, "out1"),
-        [tfeti.Contact("out0", "in1", gap=-0.01, friction=tfeti.Coulomb(0.2), name="fit")],
-    )
+
+    def load(v, ds):
+        return twist * (x * v[1] - y * v[0]) * ds(d.surface("in0"))
+
+    fit = tfeti.Contact("out0", "in1", gap=-0.01, friction=tfeti.Coulomb(0.2), name="fit")
+    p = two_body_problem(d, load, clamped(d, "out1"), [fit])
     p.solve()
     fit = p.solution.contact("fit")
     pressed, turned = comm.allreduce(fit.force.sum()), abs(fit.resultant.moment[2])

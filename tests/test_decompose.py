@@ -126,12 +126,8 @@ def test_bisection_cuts_between_layers():
     kind = dmesh.CellType.tetrahedron
     mesh = dmesh.create_box(MPI.COMM_WORLD, [(0, 0, 0), (5, 1, 0.2)], [10, 2, 2], kind)
     d = tfeti.decompose(mesh, 3)
-    layer = np.floor(
-        2.0
-        * dmesh.compute_midpoints(
-            d.mesh, d.mesh.topology.dim, np.arange(len(d.original_cells), dtype=np.int32)
-        )[:, 0]
-    ).astype(int)
+    cells = np.arange(len(d.original_cells), dtype=np.int32)
+    layer = np.floor(2.0 * dmesh.compute_midpoints(d.mesh, 3, cells)[:, 0]).astype(int)
     found = {(int(k), int(s)) for k, s in zip(layer, d.cell_subdomain, strict=True)}
     assert len(set().union(*d.comm.allgather(found))) == 10
 

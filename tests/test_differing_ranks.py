@@ -134,6 +134,12 @@ def thrown(**given):
     return do
 
 
+def pictured(s, folder):
+    """Draw the pressure of another contact on one rank."""
+    solution = s.solved(contacts=[floor(), floor()]).solution
+    plot_pressure(folder / "a.png", solution, lambda x: x[0], contact=int(ODD))
+
+
 def of_depth(x, depth):
     return depth + 0 * x[0]
 
@@ -172,7 +178,7 @@ def of_side(x):
 
 
 COULOMB = tfeti.Coulomb(0.3)
-ON = r" on rank \d and "
+ON, WHERE = r" on rank \d and ", "where rank 0 has called"
 CASES = {
     "friction on one": (
         contacts([floor()], [floor(friction=COULOMB)]),
@@ -196,7 +202,7 @@ CASES = {
         lambda s, folder: s.problem(stress=raising),
         r"stress\(u\): ZeroDivisionError: no such place",
     ),
-    "update on one": (update_on_one, r"rank \d has called update where rank 0 has called solve"),
+    "update on one": (update_on_one, rf"rank \d has called update {WHERE} solve"),
     "other times on one": (other_times_on_one, rf"the number of times is 3{ON}2 on rank 0"),
     "a state that is cut on one": (broken, "the state is broken: u has"),
     "a condition of another value on one": (
@@ -209,15 +215,7 @@ CASES = {
         ),
         rf"path is '.*b.xdmf'{ON}'.*a.xdmf' on rank 0",
     ),
-    "a picture of another contact on one": (
-        lambda s, folder: plot_pressure(
-            folder / "a.png",
-            s.solved(contacts=[floor(), floor()]).solution,
-            lambda x: x[0],
-            contact=int(ODD),
-        ),
-        rf"contact is 1{ON}0 on rank 0",
-    ),
+    "a picture of another contact on one": (pictured, rf"contact is 1{ON}0 on rank 0"),
     "surfaces on others": (decomposed_on_one, rf"surfaces: left is the callable of_side{ON}1 on"),
     "an extension on one": (
         lambda s, folder: s.problem(extensions=Extensions(monitor=print) if ODD else None),
@@ -225,10 +223,7 @@ CASES = {
     ),
     "no form on one": (lambda s, folder: s.solved(L=5 if ODD else None), rf"L is 5{ON}a Form"),
     "a constant of another value on one": (another_constant, r"L: constants\[0\]\[1\] is -0.06"),
-    "accept on others": (
-        accepted_on_one,
-        r"rank \d has called solve where rank 0 has called accept",
-    ),
+    "accept on others": (accepted_on_one, rf"rank \d has called solve {WHERE} accept"),
     "an apply that fails before an update": (apply_that_fails_before_an_update, "no such place"),
     "data of another contact on one": (
         of_solution(lambda of: of.contact(0), lambda of: of.contact("again")),
@@ -247,10 +242,7 @@ CASES = {
         rf"the number of points is 2{ON}1 on rank 0",
     ),
     "a form of another mesh on one": (on_another_mesh, "the space is on another mesh"),
-    "a field on one": (
-        a_field_on_one,
-        r"rank \d has called to_original where rank 0 has called locate_facets",
-    ),
+    "a field on one": (a_field_on_one, rf"rank \d has called to_original {WHERE} locate_facets"),
     "tolerances of Newton's method on one": (
         nonlinear(tolerances=tfeti.NewtonTolerances(max_it=9 if ODD else 8)),
         rf"tolerances: max_it is 9{ON}8 on rank 0",

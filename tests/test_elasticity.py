@@ -92,9 +92,8 @@ def test_moduli_by_names(names, comm):
     volumes = {"lower": lambda x: x[1] <= 0.5, "upper": lambda x: x[1] >= 0.5}
     d = tfeti.decompose(mesh, 4, facet_tags=facet_tags, surfaces=sides, volumes=volumes)
     value = {"lower": 1.0, 1: 1.0, "upper": 8.0, 2: 8.0}
-    elastic = tfeti.Elasticity(
-        d, E={name: value[name] for name in names}, nu={"upper": 0.3, "lower": 0.2}, model=MODELS[0]
-    )
+    given = {"E": {name: value[name] for name in names}, "nu": {"upper": 0.3, "lower": 0.2}}
+    elastic = tfeti.Elasticity(d, **given, model=MODELS[0])
     problem = compressed(d, elastic, sides=("left", "right", "bottom"))
     x = problem.u.function_space.tabulate_dof_coordinates()
     y = x[:, 1]
@@ -138,10 +137,8 @@ def errors_of_shape(shape, cell, n):
     axis_of = {"bottom": 0 if shape == "shell" else 1, "top": 1}
     bcs = [roller(V, k, d.facets(side)) for side, k in axis_of.items()]
     L = -elastic.thickness * ufl.dot(ufl.FacetNormal(d.mesh), v) * inside
-    problem = tfeti.ContactProblem(
-        elastic.a(u, v), L, bcs, [], d, stress=elastic.stress, petsc_options={"rtol": 1e-8}
-    )
-    uh = problem.solve()
+    more = {"stress": elastic.stress, "petsc_options": {"rtol": 1e-8}}
+    uh = tfeti.ContactProblem(elastic.a(u, v), L, bcs, [], d, **more).solve()
     W = fem.functionspace(d.mesh, ("Lagrange", 3, (2,)))
     w = fem.Function(W)
     w.interpolate(lambda x: exact(x[0], x[1]))

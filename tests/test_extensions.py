@@ -173,10 +173,8 @@ def test_it_keeps_the_promises_of_a_block():
 @pytest.mark.parametrize("part", [{"block": DenseBlock}, {"kplus": DensePinv}])
 def test_parts_of_a_subdomain_of_one_s_own(part, pc_type):
     floor = [tfeti.Obstacle("bottom", curved_obstacle(3))] if pc_type == "auto" else []
-    known, own = (
-        solved(floor, extensions, tfeti_pc_type=pc_type)[0]
-        for extensions in (None, Extensions(**part))
-    )
+    both = (None, Extensions(**part))
+    known, own = (solved(floor, parts, tfeti_pc_type=pc_type)[0] for parts in both)
     assert apart(own, known) <= 1e-7
 
 

@@ -131,11 +131,7 @@ def test_files_of_a_series(shared_tmp):
     assert number_of_steps(path) == 3
     assert {f.name for f in path.parent.iterdir()} == {"series.bp", "series_cells.bp"}
     size = driven.problem.decomposition.comm.size
-    expected = {
-        "checkpoint.json",
-        "records.jsonl",
-        *(f"state_3_{rank}.npz" for rank in range(size)),
-    }
+    expected = {"checkpoint.json", "records.jsonl", *(f"state_3_{r}.npz" for r in range(size))}
     expected |= {f"fields_{n}_{rank}.npz" for n in (1, 2, 3) for rank in range(size)}
     assert {f.name for f in folder.iterdir()} == expected
     lines = (folder / "records.jsonl").read_text().splitlines()
@@ -153,10 +149,8 @@ def test_a_series_for_pyvista_goes_on(comm, shared_tmp):
     path, folder = shared_tmp / "series.pvd", shared_tmp / "checkpoint"
     for number in (2, 3):
         driven = Driven(n=3)
-        steps = tfeti.LoadSteps(
-            driven.problem, driven.apply, TIMES[:number], path=path, checkpoint=folder
-        )
-        steps.run(resume=True)
+        given = driven.problem, driven.apply, TIMES[:number]
+        tfeti.LoadSteps(*given, path=path, checkpoint=folder).run(resume=True)
     comm.barrier()
     reader = pyvista.get_reader(path)
     assert reader.time_values == TIMES[:3]

@@ -58,9 +58,8 @@ def test_matching_meshes_give_node_to_node_rows(cell):
     order = np.argsort(records.condition, kind="stable")
     assert np.array_equal(records.condition[order], np.repeat(np.arange(len(records)), 2))
     pairs = records.coefficients(0)[order].reshape(-1, 2, d.mesh.geometry.dim)
-    own = records.entry_group[order].reshape(-1, 2) == (
-        records.group[:, None] + dofs.group_offsets[d.comm.rank]
-    )
+    group = records.group[:, None] + dofs.group_offsets[d.comm.rank]
+    own = records.entry_group[order].reshape(-1, 2) == group
     assert np.all(own.sum(axis=1) == 1)
     sign = np.where(own, 1.0, -1.0)[:, :, None]
     assert np.allclose(pairs, sign * records.normal[:, None], rtol=0, atol=1e-13)
@@ -110,18 +109,9 @@ def test_independent_active_set(cell, n, secondary):
 
 
 def test_pairs_out_of_reach_join_when_they_overlap():
-    near, late = (
-        lever(
-            "hexahedron",
-            gap=0.001,
-            rtol=1e-10,
-            pc_type="none",
-            contact=sided(*PAIR.surfaces, reach=reach),
-        )
-        for reach in (0.01, 1e-4)
-    )
-    near.solve()
-    late.solve()
+    pairs = [sided(*PAIR.surfaces, reach=reach) for reach in (0.01, 1e-4)]
+    given = {"gap": 0.001, "rtol": 1e-10, "pc_type": "none"}
+    near, late = (solved(lever("hexahedron", contact=pair, **given)) for pair in pairs)
     assert near.report.late_contact_rows == 0
     assert late.report.late_contact_rows > 0
     assert late.report.contact_rows <= near.report.contact_rows
@@ -191,8 +181,7 @@ def test_obstacle_under_a_uniform_pressure(cell, degree):
     gdim = d.mesh.geometry.dim
     up = np.eye(3)[gdim - 1][:gdim]
     sides = ["lower bottom", "lower left", "lower right", "upper left"]
-    if gdim == 3:
-        sides += ["lower front", "upper front"]
+    sides += ["lower front", "upper front"] if gdim == 3 else []
     plane = tfeti.Obstacle("upper bottom", tfeti.Plane(tuple(0.4 * up), tuple(up)))
     problem = two_body_problem(d, pressed(d), held(d, *sides), [plane], degree, **TO_ROUNDING)
     problem.solve()

@@ -161,8 +161,7 @@ def test_only_subdomains_with_a_new_tangent_are_factored_again(comm):
         accepted(problem)
         counts.append((problem.report.assemblies, problem.report.factorizations))
     (first, all_made), (again, made_again) = counts
-    assert first > 1
-    assert again > 1
+    assert min(first, again) > 1
     assert all_made == 2 * 4 + 2 * (first - 1)
     assert made_again <= 2 * again
 
@@ -420,11 +419,10 @@ def test_a_ready_law_is_updated_and_committed_however_it_is_passed(comm):
 
 
 def test_a_tangent_of_another_problem_is_named(comm):
-    decomposition, u, v, elastic, value, bc = small(comm)
+    d, u, v, elastic, value, bc = small(comm)
     J = 0.01 * elastic.a(ufl.TrialFunction(u.function_space), v)
-    given, tolerances = (elastic.a(u, v), u, [bc]), tfeti.NewtonTolerances(max_it=4)
-    more = {"J": J, "tolerances": tolerances}
-    problem = tfeti.NonlinearContactProblem(*given, [plane(2)], decomposition, **more)
+    given, few = (elastic.a(u, v), u, [bc], [plane(2)], d), tfeti.NewtonTolerances(max_it=4)
+    problem = tfeti.NonlinearContactProblem(*given, J=J, tolerances=few)
     value.value[-1] = -0.1
     with pytest.raises(tfeti.ConvergenceError, match="J that is the derivative of F, as J2P"):
         problem.solve()

@@ -121,10 +121,9 @@ def test_a_linear_body_takes_the_steps_of_the_linear_problem(stabilised, comm):
     velocity.x.array[:] = scene.problem._system.forms.inertia.motion.v
     plane = tfeti.Plane((0.0, -0.02), (0.0, 1.0))
     contact = tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(0.3), reach=1.0, name="plane")
-    given = {"mass": 1.0, "velocity": velocity, "stabilised": stabilised}
-    problem = tfeti.NonlinearContactDynamics(
-        F, u, [], [contact], d, **given, petsc_options={"rtol": 1e-10}
-    )
+    given = {"mass": 1.0, "velocity": velocity, "petsc_options": {"rtol": 1e-10}}
+    given["stabilised"] = stabilised
+    problem = tfeti.NonlinearContactDynamics(F, u, [], [contact], d, **given)
     problem.take_step(0.1)
     touched, most = 0, 0.0
     for n in range(10):
@@ -149,9 +148,8 @@ def test_an_impact_in_finite_strain_balances(stabilised, comm):
     """A block that turns hits a plane with its corner: forces change momentum, energy balances."""
     plane = tfeti.Plane((0.0, -0.1), (0.0, 1.0))
     contact = tfeti.Obstacle("low", plane, reach=3.0)
-    problem, kept = rubber(
-        velocity=spinning, contacts=[contact], stabilised=stabilised, subdomains=2, rtol=1e-9
-    )
+    given = {"contacts": [contact], "stabilised": stabilised, "rtol": 1e-9}
+    problem, kept = rubber(velocity=spinning, subdomains=2, **given)
     begin, tau, impulse = kept(), 0.1, 0.0
     problem.take_step(tau)
     for _ in range(14):
@@ -212,10 +210,8 @@ def test_a_plastic_impact_loses_energy_and_goes_on_from_its_checkpoint(comm, sha
 
     def series(until, folder, resume=False):
         problem, steel = bar(comm)
-        steps = tfeti.LoadSteps(
-            problem, lambda *_: None, times[:until], checkpoint=shared_tmp / folder
-        )
-        records = steps.run(resume=resume)
+        given = problem, lambda *_: None, times[:until]
+        records = tfeti.LoadSteps(*given, checkpoint=shared_tmp / folder).run(resume=resume)
         v = problem.solution.velocity.x.array.copy()
         return records, problem.u.x.array.copy(), v, steel.p.x.array.copy()
 

@@ -41,9 +41,7 @@ def bent(cell):
 
 def space(mesh, family, degree, shape):
     if family == "quadrature":
-        element = basix.ufl.quadrature_element(
-            mesh.topology.cell_type.name, degree=degree, value_shape=shape
-        )
+        element = basix.ufl.quadrature_element(mesh.basix_cell(), degree=degree, value_shape=shape)
     else:
         element = basix.ufl.element(family, mesh.basix_cell(), degree, shape=shape)
     return fem.functionspace(mesh, element)

@@ -37,8 +37,7 @@ def error_of_displacement(problem):
     gdim = V.mesh.geometry.dim
     x = V.tabulate_dof_coordinates()
     u = problem.u.x.array.reshape(-1, gdim)[: len(x)]
-    exact = linear_displacement(x, gdim)
-    return largest(u - exact)
+    return largest(u - linear_displacement(x, gdim))
 
 
 def pressures(problem):
@@ -89,16 +88,12 @@ def test_uniform_pressure_between_bodies_that_are_held_all_around(cell, degree):
     def bcs(V):
         exact = fem.Function(V)
         exact.interpolate(lambda x: linear_displacement(x.T, gdim).T)
-        names = [
-            "lower bottom",
-            *(f"{body} {side}" for body in ("lower", "upper") for side in sides),
-        ]
-        return [clamp(V, d.facets(name), exact) for name in names]
+        names = [f"{body} {side}" for body in ("lower", "upper") for side in sides]
+        return [clamp(V, d.facets(name), exact) for name in ["lower bottom", *names]]
 
     for order in ORDERS:
-        problem = solved(
-            two_body_problem(d, pressed(d, PRESSURE), bcs, [sided(*order)], degree, **TO_ROUNDING)
-        )
+        given = pressed(d, PRESSURE), bcs, [sided(*order)], degree
+        problem = solved(two_body_problem(d, *given, **TO_ROUNDING))
         assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
         assert np.isclose(np.abs(problem.solution.contact().resultant.force[-1]), PRESSURE)
         assert error_of_displacement(problem) < 1e-9
@@ -189,9 +184,8 @@ def test_hardly_covered_facets_cost_nothing():
     taken = []
     for share in (0.5, 1e-3, 1e-8):
         d = stacked("quadrilateral", 3, 4, 4, upper=(0.0, 4 / (3 + share)))
-        sides = [*sides_of("quadrilateral"), "upper right"]
-        problem = solved(
-            two_body_problem(d, pressed(d), held(d, *sides), [sided("upper bottom", "lower top")])
-        )
+        bcs = held(d, *sides_of("quadrilateral"), "upper right")
+        pair = sided("upper bottom", "lower top")
+        problem = solved(two_body_problem(d, pressed(d), bcs, [pair]))
         taken.append(problem.report.F_multiplications)
     assert max(taken) <= 1.5 * taken[0]

@@ -33,15 +33,10 @@ class Repeated:
         self.load = fem.Constant(d.mesh, np.array([0.0] * (gdim - 1) + [-0.05]))
         self.held = fem.Constant(d.mesh, np.zeros(gdim))
         obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2, friction=friction)
-        self.problem = tfeti.ContactProblem(
-            self.E * elastic(u, v),
-            ufl.dot(self.load, v) * ds(d.surface("top")),
-            [clamp(V, d.facets("left"), self.held)],
-            [obstacle] if contact else [],
-            d,
-            petsc_options={"rtol": 1e-10, **options},
-            extensions=extensions,
-        )
+        given = self.E * elastic(u, v), ufl.dot(self.load, v) * ds(d.surface("top"))
+        bcs, contacts = [clamp(V, d.facets("left"), self.held)], [obstacle] if contact else []
+        more = {"petsc_options": {"rtol": 1e-10, **options}, "extensions": extensions}
+        self.problem = tfeti.ContactProblem(*given, bcs, contacts, d, **more)
         self.cell, self.contact, self.options = cell, contact, options
 
     def change(self, E=1.0, load=-0.05, held=0.0):
@@ -64,22 +59,10 @@ def counters(report):
     return [getattr(report, name) for name in COUNTERS]
 
 
-def distance(solution, other):
-    """Largest difference of two displacements over the largest displacement."""
-    return apart(solution.u, other.u)
-
-
-SCENES = [
-    ("hexahedron", True, "newton"),
-    ("triangle", True, "smalse"),
-    ("tetrahedron", False, "pcpg"),
-]
-
-
-@pytest.fixture(params=SCENES)
+@pytest.fixture(params=[("hexahedron", "newton"), ("triangle", "smalse"), ("tetrahedron", "pcpg")])
 def scene(request):
-    cell, contact, qp_type = request.param
-    made = Repeated(cell, contact, qp_type=qp_type)
+    cell, qp_type = request.param
+    made = Repeated(cell, contact=qp_type != "pcpg", qp_type=qp_type)
     yield made
     made.problem.destroy()
 
@@ -101,7 +84,7 @@ def test_the_same_load_again_costs_next_to_nothing(scene):
     assert report.F_multiplications + report.power_method_multiplications <= 2
     assert counters(report) == [0] * len(COUNTERS)
     assert set(report.reused) >= MADE_ONCE | {"right side", "load", "linear term"}
-    assert distance(second, first) <= 1e-9
+    assert apart(second.u, first.u) <= 1e-9
     assert second is not first
     assert np.array_equal(first.u, before)
     assert np.array_equal(first.lam, lam)
@@ -115,8 +98,8 @@ def test_another_load_makes_no_row_and_no_factor(scene):
     assert counters(report) == [0] * len(COUNTERS)
     assert set(report.reused) >= MADE_ONCE
     assert "load" not in report.reused
-    assert distance(second, scene.fresh(load=-0.08)) <= 1e-8
-    assert distance(second, first) > 1e-2
+    assert apart(second.u, scene.fresh(load=-0.08).u) <= 1e-8
+    assert apart(second.u, first.u) > 1e-2
     assert np.array_equal(first.displacement.x.array, before)
 
 
@@ -166,17 +149,17 @@ def test_other_data_make_what_depends_on_them_alone(scene):
     second = scene.solve(held=-0.01)
     assert counters(scene.problem.report) == [0] * len(COUNTERS)
     assert "right side" not in scene.problem.report.reused
-    assert distance(second, scene.fresh(held=-0.01)) <= 1e-8
+    assert apart(second.u, scene.fresh(held=-0.01).u) <= 1e-8
     third = scene.solve(E=2.0)
     report = scene.problem.report
     assert report.searches == 0
     assert report.assemblies == report.gluings == report.coarse_factorizations == 1
     assert report.factorizations > 0
-    assert distance(third, scene.fresh(E=2.0)) <= 1e-8
+    assert apart(third.u, scene.fresh(E=2.0).u) <= 1e-8
     assert (report.in_all["solves"], report.in_all["searches"]) == (3, 1)
     assert len(set(scene.problem.decomposition.comm.allgather(report.details()))) == 1
     scene.problem.destroy()
-    assert distance(scene.solve(), first) <= 1e-9
+    assert apart(scene.solve().u, first.u) <= 1e-9
 
 
 def test_another_gap_makes_no_row(pair):
@@ -187,9 +170,9 @@ def test_another_gap_makes_no_row(pair):
     scene.problem.update(gap={name: 0.01})
     second = scene.solve()
     assert counters(scene.problem.report) == [0] * len(COUNTERS)
-    assert distance(second, first) > 1e-3
+    assert apart(second.u, first.u) > 1e-3
     other.problem.update(gap={0: 0.01})
-    assert distance(second, other.solve()) <= 1e-8
+    assert apart(second.u, other.solve().u) <= 1e-8
     assert np.array_equal(first.remaining_gap, before)
 
 
@@ -202,28 +185,25 @@ def test_other_forms_and_conditions(pair):
     scene.problem.update(load=ufl.dot(2.0 * scene.load, v) * ds(d.surface("top")))
     twice = scene.solve()
     assert counters(scene.problem.report) == [0] * len(COUNTERS)
-    assert distance(twice, other.solve(load=-0.1)) <= 1e-8
+    assert apart(twice.u, other.solve(load=-0.1).u) <= 1e-8
     scene.problem.update(stiffness=2.0 * elastic(u, v))
-    assert distance(scene.solve(), other.solve(load=-0.1, E=2.0)) <= 1e-8
+    assert apart(scene.solve().u, other.solve(load=-0.1, E=2.0).u) <= 1e-8
     scene.problem.update(values=[clamp(V, d.facets("right"), scene.held)])
     mirrored = scene.solve()
     assert scene.problem.report.gluings == 1
     assert scene.problem.report.factorizations == 0
     assert scene.problem.report.searches == 0
-    assert distance(mirrored, first) > 1e-2
+    assert apart(mirrored.u, first.u) > 1e-2
 
 
-@pytest.mark.parametrize("change", [{"E": 3.0}, {}])
-def test_factors_go_at_once_with_what_needs_them(change):
+@pytest.mark.parametrize("act", [lambda s: s.solve(E=3.0), lambda s: s.problem.destroy()])
+def test_factors_go_at_once_with_what_needs_them(act):
     """No collection of cycles is waited for: at most one generation of factors takes memory."""
     scene = solved(Repeated())
     gc.disable()
     try:
         old = [ref(block.stiffness) for block in scene.problem.dual.subdomains.blocks]
-        if change:
-            scene.solve(**change)
-        else:
-            scene.problem.destroy()
+        act(scene)
         assert [stiffness() for stiffness in old] == [None] * len(old)
     finally:
         gc.enable()
@@ -237,7 +217,7 @@ def test_factors_that_failed_are_made_again():
             scene.solve(E=-1.0)
     assert scene.problem.report.assemblies == 0
     assert not {"factors", "coarse problem"} & set(scene.problem.report.reused)
-    assert distance(scene.solve(), scene.fresh()) <= 1e-8
+    assert apart(scene.solve().u, scene.fresh().u) <= 1e-8
 
 
 def test_a_mesh_that_has_moved_is_searched_again(pair):
@@ -247,8 +227,8 @@ def test_a_mesh_that_has_moved_is_searched_again(pair):
         item.problem.decomposition.mesh.geometry.x[:, 1] -= 0.015
     second = scene.solve()
     assert scene.problem.report.searches == 1
-    assert distance(second, other.solve()) <= 1e-8
-    assert distance(second, first) > 1e-2
+    assert apart(second.u, other.solve().u) <= 1e-8
+    assert apart(second.u, first.u) > 1e-2
 
 
 def test_the_stress_of_an_earlier_solution_is_that_of_its_modulus():
@@ -279,17 +259,12 @@ def test_an_update_that_raises_has_changed_nothing(pair):
     first = scene.solve()
     V = scene.problem.dofs.V
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    good = {
-        "stiffness": 2.0 * elastic(u, v),
-        "load": ufl.ZeroBaseForm((v,)),
-        "values": [],
-        "gap": {0: 0.1},
-    }
-    bad = {"load": 1, "values": [None], "gap": {0: np.nan}}
-    for name, value in bad.items():
+    good = {"stiffness": 2.0 * elastic(u, v), "load": ufl.ZeroBaseForm((v,))}
+    good |= {"values": [], "gap": {0: 0.1}}
+    for name, value in {"load": 1, "values": [None], "gap": {0: np.nan}}.items():
         with pytest.raises(tfeti.InputError):
             scene.problem.update(**{**good, name: value})
-        assert distance(scene.solve(), first) <= 1e-8
+        assert apart(scene.solve().u, first.u) <= 1e-8
         assert counters(scene.problem.report) == [0] * len(COUNTERS)
 
 

@@ -58,9 +58,8 @@ def test_other_values_and_gaps_cost_a_vector(cell, degree):
     assert np.allclose(c, expected, rtol=1e-14, atol=1e-15)
     assert MPI.COMM_WORLD.allreduce(int(np.sum(expected != first))) > 0
     assert B.stateGet() == state
-    for before, now, other in zip(
-        entries, B.getValuesCSR(), anew.constraints.B.getValuesCSR(), strict=True
-    ):
+    others = B.getValuesCSR(), anew.constraints.B.getValuesCSR()
+    for before, now, other in zip(entries, *others, strict=True):
         assert np.array_equal(before, now)
         assert np.array_equal(before, other)
     assert np.array_equal(updated.records.gap, gaps)
@@ -76,9 +75,8 @@ def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
     held, ones = prescribe(dofs, [clamp(dofs.V, d.facets("left"))]), np.ones(dofs.num_nodes * 3)
     gluing = glue(dofs, held, records, 1.0, ones)
     assert d.comm.allreduce(len(gluing.contact.decided)) == 0
-    near = glue(
-        dofs, held, searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs), 1.0, ones
-    )
+    far = searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs)
+    near = glue(dofs, held, far, 1.0, ones)
     assert d.comm.allreduce(len(near.contact.decided)) == 16
     c = np.array(near.constraints.c)
     values = np.array(near.prescribed.value)

@@ -6,10 +6,10 @@ import dataclasses
 import numpy as np
 import pytest
 import ufl
-from bodies import drawn, held, torn_boxes
+from bodies import clamped, drawn, held, torn_boxes
 from dolfinx import fem
 from panels import SPACE, polygon
-from scenes import accepted, apart, clamp, decomposed, elastic, hooke, largest, strain, vectors
+from scenes import accepted, apart, decomposed, elastic, hooke, largest, strain, unknowns, vectors
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
@@ -22,15 +22,12 @@ ROUGH = tfeti.Coulomb(0.3)
 DOWN = {2: np.array((0.0, -1.0)), 3: np.array((0.0, 0.0, -1.0))}
 
 
-def block(gdim, degree=1, n=6, hold="clamped", nu=0.3):
+def block(gdim, degree=1, n=6, hold=clamped, nu=0.3):
     """Unit square or cube on its bottom, elastic with E = 1."""
-    decomposition = decomposed(CELLS[gdim], n, 4)
-    V, u, v = vectors(decomposition, degree)
-    bcs = [clamp(V, decomposition.facets("bottom"))]
-    if hold == "rollers":
-        bcs = held(decomposition, "bottom")(V)
-    a = elastic(u, v, nu=nu)
-    return {"a": a, "L": ufl.ZeroBaseForm((v,)), "bcs": bcs, "decomposition": decomposition}
+    d = decomposed(CELLS[gdim], n, 4)
+    V, u, v = vectors(d, degree)
+    given = {"a": elastic(u, v, nu=nu), "L": ufl.ZeroBaseForm((v,)), "decomposition": d}
+    return {**given, "bcs": hold(d, "bottom")(V)}
 
 
 def top(gdim, height=1.0):
@@ -109,7 +106,7 @@ def test_an_eccentric_force_tilts_a_punch_as_in_closed_form(gdim):
     The force F at the eccentricity e within the core needs a = F/(EA) and b = Fe/(EI). Multipliers
     have no linear pressure: an error of h². It may be given at a far point, with its moment.
     """
-    scene = block(gdim, degree=2, n=8 if gdim == 2 else 4, hold="rollers", nu=0.0)
+    scene = block(gdim, degree=2, n=8 if gdim == 2 else 4, hold=held, nu=0.0)
     force, e = 0.02, 0.1
     at = np.full(gdim, 0.5)
     at[-1] = 1.0
@@ -147,17 +144,13 @@ def test_one_tool_on_two_surfaces_has_the_statics_of_a_beam():
         return np.stack((x[0] - (x[0] >= 0.5), x[1] - 1.5, 0 * x[0]))
 
     shapes = tfeti.SignedDistance(lambda x: np.linalg.norm(way(x), axis=0) - 0.5, way)
-    bridge = tfeti.RigidBody(
-        shapes, force=(0, -0.01), free=("y", "rz"), point=(0.25, 1.0), name="bridge"
-    )
+    bridge = tfeti.RigidBody(shapes, force=(0, -0.01), free=("y", "rz"), point=(0.25, 1.0))
     data = solved(scene, tfeti.Obstacle("top", bridge)).solution.contact(0)
     left = data.points[:, 0] < 0.5
     comm = scene["decomposition"].comm
     forces = [comm.allreduce(float(data.force[side].sum())) for side in (left, ~left)]
-    normal = data.force[:, None] * data.normal
-    moment = comm.allreduce(float(np.sum((data.points[:, 0] - 0.25) * normal[:, 1])))
-    moment -= comm.allreduce(float(np.sum((data.points[:, 1] - 1.0) * normal[:, 0])))
-    assert abs(moment) <= 1e-11
+    (x, y), (right, up) = (data.points[:, :2] - (0.25, 1.0)).T, data.force * data.normal.T
+    assert abs(comm.allreduce(float(np.sum(x * up - y * right)))) <= 1e-11
     assert 2.5 <= forces[0] / forces[1] <= 3.5
 
 
@@ -183,11 +176,11 @@ def test_motions_that_nothing_resists_or_drives_are_free():
 
 def test_a_far_tool_falls_until_it_touches():
     scene = block(2)
-    tools = [
-        tfeti.RigidBody(shape, force=0.01 * DOWN[2], free=("y",))
-        for shape in (ball(2), tfeti.Sphere((0.5, 2.7), 1.0))
-    ]
-    found = [solved(scene, tfeti.Obstacle("top", tool)) for tool in tools]
+    shapes, law = (
+        (ball(2), tfeti.Sphere((0.5, 2.7), 1.0)),
+        {"force": 0.01 * DOWN[2], "free": ("y",)},
+    )
+    found = [solved(scene, tfeti.Obstacle("top", tfeti.RigidBody(s, **law))) for s in shapes]
     ways = [problem.solution.tool(0).displacement[1] for problem in found]
     assert np.isclose(ways[1], ways[0] - 0.7, rtol=1e-9)
     assert same(*found)
@@ -202,7 +195,7 @@ def test_friction_knows_only_the_relative_motion(law):
     pressed = np.array((0.0, -0.03))
     for moves in ("tool", "block"):
         way, below = (fem.Constant(decomposition.mesh, (0.0, 0.0)) for _ in range(2))
-        given = {**scene, "bcs": [clamp(W, decomposition.facets("bottom"), below)]}
+        given = {**scene, "bcs": clamped(decomposition, ("bottom", below))(W)}
         contacts = [tfeti.Obstacle("top", ball(2), displacement=way, friction=law)]
         problem = tfeti.ContactProblem(**given, contacts=contacts, petsc_options=TIGHT)
         for x in (0.0, 0.002, 0.02, 0.01):
@@ -242,9 +235,7 @@ def test_a_wheel_that_turns_drags_along():
     """Its surface slips wherever the wheel was before; the second of two turns changes nothing."""
     scene = block(2, n=8)
     angle = fem.Constant(scene["decomposition"].mesh, 0.0)
-    wheel = tfeti.RigidBody(
-        ball(2, radius=0.5), rotation=angle, displacement=0.02 * DOWN[2], large=True
-    )
+    wheel = tfeti.RigidBody(ball(2, 0.5), rotation=angle, displacement=0.02 * DOWN[2], large=True)
     contact = tfeti.Obstacle("top", wheel, friction=tfeti.Tresca(0.01))
     problem, drags = tfeti.ContactProblem(**scene, contacts=[contact], petsc_options=TIGHT), []
     for value in (0.0, 0.004, 3.0, 3.1, 3.0):
@@ -274,14 +265,12 @@ def test_load_steps_take_laws_of_time_and_write_a_table(tmp_path):
             rows = list(csv.DictReader(file))
         assert [float(row["ball force y"]) for row in rows] == forces
     comm.Barrier()
-    pressed = tfeti.RigidBody(
-        ball(2), force=lambda t: (0.0, -t * forces[-1]), free=("y",), name="ball"
-    )
-    problem = tfeti.ContactProblem(**scene, contacts=[tfeti.Obstacle("top", pressed)])
+    tool = tfeti.RigidBody(ball(2), force=lambda t: (0.0, -t * forces[-1]), free=("y",), name="b")
+    problem = tfeti.ContactProblem(**scene, contacts=[tfeti.Obstacle("top", tool)])
     back = tfeti.LoadSteps(problem, lambda problem, t: None, [0.25, 0.5, 1.0]).run()
     counts = [[r.figures["F_multiplications"] for r in run] for run in (records, back)]
     assert sum(counts[1]) < sum(counts[0])  # products with multiples of a solution are known
-    assert np.isclose(back[-1].tools["ball displacement y"], -0.04, rtol=1e-5)
+    assert np.isclose(back[-1].tools["b displacement y"], -0.04, rtol=1e-5)
 
 
 def test_a_tool_that_hits_is_a_body_that_falls():
@@ -355,18 +344,16 @@ def test_tools_inside_of_a_body_or_of_one_name_are_named():
 def nonlinear(finite, tool, friction=None):
     """Problem of a tool on a block: J2 in small strain, neo-Hooke in finite strain."""
     decomposition = decomposed("triangle", 6, 4)
-    V, _, v = vectors(decomposition)
-    u = fem.Function(V)
+    V, u, v, _ = unknowns(decomposition)
     if finite:
         residual = ufl.derivative(neo_hooke(u, 1.0, 0.3) * DX, u, v)
     else:
         elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
-        steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.05, hardening=0.1)
-        residual = steel.residual(v)
-    given = u, [clamp(V, decomposition.facets("bottom"))]
+        residual = tfeti.J2Plasticity(elastic, u, yield_stress=0.05, hardening=0.1).residual(v)
     contacts = [tfeti.Obstacle("top", tool, friction=friction)]
+    given = u, clamped(decomposition, "bottom")(V), contacts, decomposition
     more = {"finite": finite, "petsc_options": {"rtol": 1e-9}}
-    return tfeti.NonlinearContactProblem(residual, *given, contacts, decomposition, **more)
+    return tfeti.NonlinearContactProblem(residual, *given, **more)
 
 
 def pressed(finite, shape, **given):
@@ -432,8 +419,7 @@ def test_a_ball_that_rolls_off_a_block_in_a_step_asks_for_smaller_ones(way):
 def test_a_body_that_was_pushed_stays_when_tools_go_back(reach, weight, finite):
     """Nothing else drives it: its motion counts from where it is, beside what another tool does."""
     decomposition = decomposed("triangle", 6, 4)
-    V, _, v = vectors(decomposition)
-    u = fem.Function(V)
+    V, u, v, _ = unknowns(decomposition)
     law = neo_hooke(u, 1.0, 0.3) if finite else 0.5 * ufl.inner(hooke()(u), strain(u))
     energy = law + fem.Constant(decomposition.mesh, weight) * u[1]
     ways = [fem.Constant(decomposition.mesh, (0.0, 0.0)) for _ in range(2)]

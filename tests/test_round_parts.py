@@ -3,11 +3,10 @@
 import numpy as np
 import pymetis
 import pytest
-import ufl
-from dolfinx import fem
+from bodies import clamped, no_load, two_body_problem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import box, clamp, solved, vectors
+from scenes import box, solved
 from scipy.spatial import Delaunay
 
 import tfeti_dolfinx as tfeti
@@ -27,9 +26,9 @@ def whole_midpoints(n):
     return np.stack(np.indices((n,) * 3), axis=-1).reshape(-1, 3).astype(float)
 
 
-def untorn(kind, cells, x):
+def untorn(kind, cells, x, comm=COMM):
     """A mesh, every so many cells on a rank: as much ghosts as there may be."""
-    own = np.arange(COMM.rank, len(cells), COMM.size)
+    own = np.arange(comm.rank, len(cells), comm.size)
     nodes, places = np.unique(cells[own], return_inverse=True)
     facets = 6 if kind == "hexahedron" else 4
     return UntornMesh(
@@ -104,9 +103,8 @@ def test_parts_of_a_strongly_graded_cloud_are_balanced(parts):
     rng, r = np.random.default_rng(0), np.linspace(0.0, 1.0, 10_000)
     share = np.cumsum(r**2 / (0.0055 + 0.2 * np.maximum(r - 0.15, 0.0)) ** 3)
     x = rng.normal(size=(60_000, 3))
-    x *= (np.interp(rng.uniform(0, share[-1], len(x)), share, r) / np.linalg.norm(x, axis=1))[
-        :, None
-    ]
+    radius = np.interp(rng.uniform(0, share[-1], len(x)), share, r)
+    x *= (radius / np.linalg.norm(x, axis=1))[:, None]
     x = np.rint(2.0**20 * x)
     key, body = np.arange(len(x), dtype=np.uint64), np.zeros(len(x), dtype=np.int64)
     own = slice(COMM.rank, None, COMM.size)
@@ -145,11 +143,7 @@ def test_parts_are_connected_balanced_and_as_round_as_those_of_metis():
     assert size.min() > 0.85
     assert size.max() < 1.12
     # METIS has the whole mesh on each rank here
-    whole = tetrahedra(3000)
-    alone = UntornMesh(
-        *(mesh.cell_type, None, whole[0], np.arange(len(whole[0])), None, None),
-        *(np.arange(3000), whole[1], PhysicalNames()),
-    )
+    alone = untorn("tetrahedron", *tetrahedra(3000), MPI.COMM_SELF)
     lone = CellGraph(alone, MPI.COMM_SELF)
     first, second = pairs(lone)
     start = np.searchsorted(first, np.arange(lone.num_cells + 1))
@@ -165,12 +159,9 @@ def test_parts_of_a_graded_mesh_cost_what_those_of_others_do():
     """A half ball on a plane, cells there 100 times shorter than its radius; boxes take 67 F."""
     model = build(1.0, 0.0112, 0.15, 0.2) if COMM.rank == 0 else None
     cut = tfeti.read_gmsh(model, COMM, 40)
-    V, u, v = vectors(cut)
-    a = tfeti.Elasticity(cut, E=1.0, nu=0.3).a(u, v)
-    down = fem.Constant(cut.mesh, (0.0, 0.0, -0.01))
-    bcs = [clamp(V, cut.facets("top"), down)]
+    bcs = clamped(cut, ("top", np.array([0.0, 0.0, -0.01])))
     plane = tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)))
-    problem = solved(tfeti.ContactProblem(a, ufl.ZeroBaseForm((v,)), bcs, [plane], cut))
+    problem = solved(two_body_problem(cut, no_load, bcs, [plane]))
     assert problem.report.F_multiplications < 25
 
 

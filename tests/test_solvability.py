@@ -148,10 +148,8 @@ def test_random_rigid_scenes_against_a_plain_program():
 
 def test_rounding_between_pairs_of_bodies_holds_nothing():
     """Each of two pairs moves as one, though a row of 1e-8 links a body of one to the other's."""
-    one, zero = np.eye(3), np.zeros((3, 3))
-    J = np.block(
-        [[one, zero, zero, -one], [zero, one, -one, zero], [zero, zero, 1e-8 * one, -1e-8 * one]]
-    )
+    one, zero, tiny = np.eye(3), np.zeros((3, 3)), 1e-8 * np.eye(3)
+    J = np.block([[one, zero, zero, -one], [zero, one, -one, zero], [zero, zero, tiny, -tiny]])
     found = unresisted([gram(J, 4, 3)], unsprung(np.zeros((4, 3, 3))))
     assert not found.free.any()
     joint = np.linalg.qr(found.joint.toarray())[0]

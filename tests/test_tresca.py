@@ -12,9 +12,8 @@ import tfeti_dolfinx as tfeti
 
 EXACT = {"rtol": 1e-10}
 AT_REST = 1e-6
-SOLVERS = pytest.mark.parametrize(
-    "qp_type", ["newton", pytest.param("smalse", marks=pytest.mark.slow)]
-)
+BOTH = ["newton", pytest.param("smalse", marks=pytest.mark.slow)]
+SOLVERS = pytest.mark.parametrize("qp_type", BOTH)
 
 
 def frame_of(gdim, angle, normal):
@@ -137,14 +136,8 @@ def two_boxes(
     d = torn_boxes(cell, untorn.parts(gdim, n, n, apart), max(subdomains, 2))
     V, a, L = forms(d.mesh, d.facet_tags, traction, d.surface("upper top"))
     clamped = ("lower bottom", "upper left")
-    pair = tfeti.Contact(
-        "lower top",
-        "upper bottom",
-        secondary=secondary,
-        gap=0.0,
-        friction=law_of(kind, bounds, angle),
-        reach=0.3,
-    )
+    given = {"secondary": secondary, "gap": 0.0, "reach": 0.3}
+    pair = tfeti.Contact("lower top", "upper bottom", friction=law_of(kind, bounds, angle), **given)
     bcs = [clamp(V, d.facets(name)) for name in clamped]
     options = {**EXACT, **more}
     p = solved(tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=options))
