@@ -436,10 +436,8 @@ class Contact(ContactPartner):
         size, per_area = _ratios(found, sides, dofs, stiffness)
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
         exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0
-        worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
         auto, finite = self.secondary == "auto", dofs.nodes is not None
-        little = not _is_believed(found, dofs)
-        if little or worse or (auto and (exchange or finite)):
+        if (little := not _is_believed(found, dofs)) or (auto and (exchange or finite)):
             other = settled._meet(sides[::-1], dofs, contact, reach, reach, held)
             useful = _is_believed(other, dofs)  # `little` is so of the other side, too, or not
             better = useful if useful == little else _is_better(other, found, dofs, exchange)
@@ -448,8 +446,9 @@ class Contact(ContactPartner):
                 found = other
             elif little and useful and dofs.comm.rank == 0:
                 log.warning(LITTLE, self.name, settled.b, settled.a, settled.b)
-            elif better and worse and dofs.comm.rank == 0:
-                log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
+        worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
+        if worse and not auto and dofs.comm.rank == 0:
+            log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
         facets = sides[0].facets
         cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
         edges = count_over(dofs.comm, cosine < SEARCH.crease)
