@@ -539,8 +539,7 @@ class ContactProblem:
         state = state.on_rows(system.gluing)
         # what conditions prescribed then: by now they may have other values
         values = self.dofs.reduce(state.u.reshape(-1, self.dofs.bs), np.maximum)
-        held = system.gluing.prescribed
-        held = replace(held, value=np.where(held.flag, values, 0.0))
+        held = replace(p := system.gluing.prescribed, value=np.where(p.flag, values, 0.0))
         gluing = replace(system.gluing, slip=state.slip, prescribed=held)
         dual.learn()
         if dual.recycled is not None:

@@ -560,10 +560,8 @@ def _is_better(other: ContactRecords, found: ContactRecords, dofs: TornDofs, coa
     """
     if dofs.nodes is None:
         return coarser
-    partly = [
-        any_rank(dofs.comm, r.within_reach & (r.covered < 1.0 - SEARCH.hardly_covered))
-        for r in (other, found)
-    ]
+    whole = 1.0 - SEARCH.hardly_covered
+    partly = [any_rank(dofs.comm, r.within_reach & (r.covered < whole)) for r in (other, found)]
     return partly[1] if partly[0] != partly[1] else coarser
 
 
