@@ -13,9 +13,6 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.gmsh_model import open_model
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
-# how thin a triangle without extent is, relative: its normal is that of rounding
-FLAT = 1e-7
-
 
 class SurfaceMesh:
     """A rigid shape with a surface of triangles, in 2D of lines.
@@ -70,7 +67,7 @@ class SurfaceMesh:
         else:
             normal = np.cross(sides[:, 0], sides[:, 1])
         length, longest = np.linalg.norm(normal, axis=1), np.linalg.norm(sides, axis=2).max(axis=1)
-        wide = length > FLAT * longest ** (self._gdim - 1)
+        wide = length > SEARCH.thin * longest ** (self._gdim - 1)
         if not np.any(wide):
             raise InputError("SurfaceMesh: no facet has an extent")
         self._facets, c, sides = self._facets[wide], c[wide], sides[wide]

@@ -189,7 +189,7 @@ def with_averaged_normals(
 def with_images(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:
     """Return facets with mirror images of those at planes of symmetry. Collective.
 
-    Images have the nodes of what they mirror: u_k is 0 on the plane, and hardly more beside it.
+    Images have the nodes of what they mirror: beside the plane u_k is hardly another than on it.
     """
     if across is None:
         return facets
