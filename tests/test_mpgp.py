@@ -49,6 +49,11 @@ def test_mpgp_slides_sticks_and_falls_off():
     assert around.face(state.x, state.g).status.tolist() == [slip, slip, stick, stick, fixed, fixed]
     assert np.allclose(state.g, A @ state.x - b, atol=1e-12)
     assert steps.proportioning > 0
+    # from a point a little inside, pushed outwards, it comes onto its circle
+    x, b = np.array([1.0 - 1e-11, 0.0]), np.array([3.0, 0.0])
+    state = MprgpIterate(matrix(np.eye(2)), x, x - b, discs([1.0]), MPI.COMM_SELF)
+    assert mprgp(state, parameters, lambda s: s.projected_gradient <= 1e-14, steps, 50) is None
+    assert np.allclose(state.x, (1.0, 0.0), rtol=0, atol=1e-14)
 
 
 def around_circles(seed, n=12):

@@ -261,7 +261,7 @@ class Product:
 # --- Ellipses ---------------------------------------------------------------------------------
 
 # of the boundary's distance from the centre: what is so near to the boundary is on it
-ON = 1e-10
+ON = 1e-13
 # of the longer semi-axis: how far a point may be, and how short the other may be
 FAR, THIN = 1e100, 1e-150
 # Newton's method for the secular equation: far more steps than it takes, and where it ends
