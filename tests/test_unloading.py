@@ -231,6 +231,34 @@ def test_a_series_comes_back_to_rest(cell, qp_type, rtol):
         scene.problem.accept()
 
 
+@pytest.mark.parametrize("mu", [0.5, 0.2, 0.05])
+def test_a_wedge_keeps_its_seat_where_friction_locks_it(mu):
+    """Between walls that lean by 0.1 it springs out without a load only if μ is less."""
+    d = decomposed("quadrilateral", 4, 4)
+    x, walls = d.mesh.geometry.x, {"left": 1.0, "right": -1.0}
+    x[:, 0] = (x[:, 0] - 0.5) * (1.0 + 0.2 * x[:, 1])
+    contacts = [
+        tfeti.Obstacle(
+            side, tfeti.Plane((-0.5 * to, 0), (to, 0.1)), gap=0.0, friction=tfeti.Coulomb(mu)
+        )
+        for side, to in walls.items()
+    ]
+    load = fem.Constant(d.mesh, np.zeros(2))
+    p = two_body_problem(d, drawn(d, "top", load), lambda V: [], contacts)
+    sunk = []
+    for pressed in (0.05, 0.1, 0.05, 0.0, 0.0, -0.01, 0.0)[: 7 if mu > 0.1 else 5]:
+        load.value[1] = -pressed
+        p.solve()
+        p.accept()
+        force = sum(p.solution.contact(i).resultant.force for i in range(2))
+        assert np.allclose(force, (0.0, 1.2 * pressed), rtol=0, atol=1e-6)
+        sunk.append(-displacement(p)[1][:, 1].mean())
+    if mu < 0.1:
+        assert np.allclose(sunk[3:], 0.0, rtol=0, atol=1e-6 * sunk[1])
+    else:
+        assert np.all(np.array(sunk[3:]) > 0.7 * sunk[1])
+
+
 @pytest.mark.parametrize(
     ("friction", "degree", "options"),
     [
