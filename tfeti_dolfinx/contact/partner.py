@@ -485,7 +485,7 @@ class Contact(ContactPartner):
                 f"{self.name}: the space is scalar; expected displacements of {gdim} components, "
                 "since surfaces meet along normals"
             )
-        sides, kind, across = [], facet_kind(dofs), _across(dofs, held)
+        sides, kind, across = [], facet_kind(dofs), held.across if held else None
         for surface in self.surfaces:
             facets = local_facets(dofs, dofs.decomposition.facets(surface), kind)
             whole = facets.radius ** (dofs.bs - 1)
@@ -510,7 +510,7 @@ class Contact(ContactPartner):
         kind, comm = facet_kind(dofs), dofs.comm
         height, deep = SEARCH.seen * reach, SEARCH.seen * depth
         distance = max(height, deep)
-        facing = with_images(sides[1].facets, dofs, _across(dofs, held))
+        facing = with_images(sides[1].facets, dofs, held.across if held else None)
         secondary, primary = rendezvous(sides[0].facets, facing, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
@@ -537,15 +537,6 @@ class Contact(ContactPartner):
                 f'{self.name}: secondary={self.secondary!r}, expected one of its surfaces or "auto"'
             ) from None
         return replace(self, a=self.b, b=self.a) if named else self
-
-
-def _across(dofs: TornDofs, held: Held) -> Array | None:
-    """Return flags of components across planes of symmetry; None in finite strain.
-
-    There Newton's method does not follow normals that turn where a surface begins or ceases to
-    bend towards the plane.
-    """
-    return held.across if held and dofs.nodes is None else None
 
 
 def _is_believed(records: ContactRecords, dofs: TornDofs) -> bool:

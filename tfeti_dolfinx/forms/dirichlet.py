@@ -72,7 +72,7 @@ class EndPlanes:
 
     def __init__(self, dofs: TornDofs, near: float = 1e-9) -> None:
         self._comm, gdim = dofs.comm, dofs.V.mesh.geometry.dim
-        x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
+        x = dofs.points(at_rest=True)[:, :gdim]
         low, high = box_over_ranks(dofs.comm, x)
         near *= np.max(high - low)
         at = np.abs(x[:, None] - np.stack((low, high))) <= near  # both ends, shape (n, 2, gdim)

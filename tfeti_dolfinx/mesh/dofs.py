@@ -126,7 +126,8 @@ class TornDofs:
         copy_offsets: First copy of each owned group, shape ``(g + 1,)``.
         copies: Global primal nodes of the owned groups, by subdomain, shape ``(c,)``.
         copy_subdomains: Their subdomains, shape ``(c,)``.
-        nodes: Places of DOLFINx's nodes in finite strain, shape ``(n, 3)``; None: on the mesh.
+        nodes: Places of DOLFINx's nodes in finite strain, and at rest, shape ``(2, n, 3)``; None:
+            on the mesh.
         axisymmetric: Whether x[0] is a radius, which integrals over contact surfaces have for a
             weight.
     """
@@ -151,9 +152,9 @@ class TornDofs:
         origin, key = node_keys(V, decomposition)
         self._find_groups(origin[self.dolfinx_node], key[self.dolfinx_node])
 
-    def points(self) -> Array:
-        """Return the place of each primal node, shape ``(n, 3)``."""
-        x = self.V.tabulate_dof_coordinates() if self.nodes is None else self.nodes
+    def points(self, at_rest: bool = False) -> Array:
+        """Return the place of each primal node, shape ``(n, 3)``, in finite strain also at rest."""
+        x = self.V.tabulate_dof_coordinates() if self.nodes is None else self.nodes[int(at_rest)]
         return np.asarray(x.take(self.dolfinx_node, axis=0))
 
     def facet_nodes(self, facets: Array) -> Array:

@@ -169,21 +169,38 @@ def with_averaged_normals(
     """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
     On a plane of symmetry they lie in it, as those of the whole surface, unless that has an edge
-    there: where the next vertices' normals are turned by no more. ``across`` has flags of owned
-    groups' components, shape ``(g, gdim)``; None: there is none. Return the averaged normal of each
-    owned group, too, 0 off them, shape ``(g, gdim)``.
+    there at rest. ``across`` has flags of owned groups' components, shape ``(g, gdim)``; None:
+    there is none. Return the averaged normal of each owned group, too, 0 off them, shape ``(g,
+    gdim)``.
     """
     groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
     averaged = unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
     if across is not None:
-        (turned,) = dofs.lookup(groups, np.where(across, 0.0, np.abs(averaged)))
-        most = turned.reshape(weighted.shape).max(axis=1, keepdims=True)
-        turned = np.broadcast_to(most, weighted.shape).reshape(turned.shape)
-        turned = dofs.reduce_on_owners(groups, turned, np.maximum)
-        bends = turned > SEARCH.bends * np.abs(averaged)
-        averaged = unit(np.where(across & bends, 0.0, averaged))
+        averaged = unit(np.where(across & ~_edges(facets, dofs, across), 0.0, averaged))
     (at_vertices,) = dofs.lookup(groups, averaged)
     return replace(facets, vertex_normals=at_vertices.reshape(weighted.shape)), averaged
+
+
+def _edges(facets: Facets, dofs: TornDofs, across: Array) -> Array:
+    """Return where the whole surface has edges on planes of symmetry, flags of groups. Collective.
+
+    There, at rest, normals of the next vertices are turned by no more than those on the plane.
+    Where bodies are Newton's method would have normals that turn from one iterate to the next.
+    """
+    groups, hats = facets.vertices.ravel(), facet_kind(dofs).hats
+    (rest,) = dofs.lookup(groups, dofs.reduce(dofs.points(at_rest=True), np.minimum))
+    middle, corners = hats.points.mean(axis=0)[None], facets.corners
+    here, there = (
+        _normals(hats, x, middle)[0]
+        for x in (corners, rest.reshape(len(facets), -1, 3)[:, :, : dofs.bs])
+    )
+    there *= np.sign(np.sum(here * facets.normal, axis=1, keepdims=True))
+    averaged = unit(dofs.reduce_on_owners(groups, np.repeat(there, corners.shape[1], axis=0)))
+    (turned,) = dofs.lookup(groups, np.where(across, 0.0, np.abs(averaged)))
+    most = turned.reshape(corners.shape).max(axis=1, keepdims=True)
+    turned = np.broadcast_to(most, corners.shape).reshape(turned.shape)
+    turned = dofs.reduce_on_owners(groups, turned, np.maximum)
+    return np.abs(averaged) > np.maximum(turned / SEARCH.bends, SEARCH.held)
 
 
 def with_images(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:

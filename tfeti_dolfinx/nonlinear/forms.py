@@ -260,8 +260,9 @@ class CurrentPlaces:
         self.moved = self._moving.x.array
         moved = self._at_points.x.array.reshape(-1, gdim)
         x[self._to, :gdim] = rest[self._to, :gdim] + moved[self._from]
-        nodes[:, :gdim] += self._here.reshape(-1, gdim)
-        self._dofs.nodes = nodes
+        here = nodes.copy()
+        here[:, :gdim] += self._here.reshape(-1, gdim)
+        self._dofs.nodes = np.stack((here, nodes))
 
     def back(self) -> None:
         """Put them to where they were. Not collective."""
