@@ -66,6 +66,8 @@ class Prescribed:
 class EndPlanes:
     """Planes x_k = c at which the whole mesh ends, and ends in facets: maybe planes of symmetry.
 
+    In finite strain it is the mesh at rest: nodes of an iterate leave a plane by its tolerance.
+
     Creation is collective. Under axisymmetry x_0 = 0 is the only one across r. What is within
     ``near``, over the mesh's extent, lies in a plane.
     """

@@ -184,15 +184,15 @@ def with_averaged_normals(
 def _edges(facets: Facets, dofs: TornDofs, across: Array) -> Array:
     """Return where the whole surface has edges on planes of symmetry, flags of groups. Collective.
 
-    There, at rest, normals of the next vertices are turned by no more than those on the plane.
-    Where bodies are Newton's method would have normals that turn from one iterate to the next.
+    There, at rest, normals of the next vertices are turned by no more than those on the plane. An
+    edge that begins or ends with an iterate would turn normals, which Newton's method does not
+    follow.
     """
     groups, hats = facets.vertices.ravel(), facet_kind(dofs).hats
     (rest,) = dofs.lookup(groups, dofs.reduce(dofs.points(at_rest=True), np.minimum))
     middle, corners = hats.points.mean(axis=0)[None], facets.corners
     here, there = (
-        _normals(hats, x, middle)[0]
-        for x in (corners, rest.reshape(len(facets), -1, 3)[:, :, : dofs.bs])
+        _normals(hats, x, middle)[0] for x in (corners, rest[:, : dofs.bs].reshape(corners.shape))
     )
     there *= np.sign(np.sum(here * facets.normal, axis=1, keepdims=True))
     averaged = unit(dofs.reduce_on_owners(groups, np.repeat(there, corners.shape[1], axis=0)))
