@@ -16,8 +16,19 @@ from bodies import (
     torn_boxes,
     two_body_problem,
 )
+from dolfinx import fem
 from mpi4py import MPI
-from scenes import CELLS, apart, by_point, decomposed, displacement, problem, solved, unknowns
+from scenes import (
+    CELLS,
+    accepted,
+    apart,
+    by_point,
+    decomposed,
+    displacement,
+    problem,
+    solved,
+    unknowns,
+)
 from true_errors import OVERLAP, ring_problem
 
 import tfeti_dolfinx as tfeti
@@ -156,6 +167,20 @@ def test_a_slant_that_begins_at_a_guide_keeps_its_normal(finite):
     p = two_bodies(finite, d, bcs, sided(*ORDERS[0]))
     normal = np.array([0.2, -1.0]) / np.hypot(0.2, 1.0)
     assert np.allclose(p.solution.contact().normal, normal, atol=0.03 if finite else 1e-8)
+
+
+def test_the_answer_in_finite_strain_does_not_depend_on_the_path():
+    """The gaps of two nodes would be the lowest one of a point that is common to them."""
+    ends = []
+    for path in ((-0.1,), (-0.05, -0.1)):
+        d = bent("quadrilateral", 10, 8, 0.0, 1.0)
+        way = fem.Constant(d.mesh, (0.0, path[0]))
+        bcs = clamped(d, "lower bottom", ("upper top", way))
+        p = two_bodies(True, d, bcs, sided(*ORDERS[0], gap="curved", reach=0.4))
+        for way.value[1] in path:
+            accepted(p)
+        ends.append(displacement(p)[1])
+    assert apart(*ends) < 1e-6
 
 
 def against_lame(p):
