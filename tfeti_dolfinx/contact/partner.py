@@ -522,7 +522,7 @@ class Contact(ContactPartner):
                 f"{self.name}: the surfaces are near but face away from each other; expected "
                 "outward normals that oppose each other"
             )
-        found = conditions(dofs, contact, sides[0], integrals)
+        found = conditions(dofs, contact, sides[0], integrals, sides[1])
         return self._with_gaps_and_friction(dofs, found, reach, depth)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:

@@ -181,18 +181,27 @@ class Side:
 
 
 def conditions(
-    dofs: TornDofs, contact: int, side: Side, integrals: MortarIntegrals
+    dofs: TornDofs,
+    contact: int,
+    side: Side,
+    integrals: MortarIntegrals,
+    other: Side | None = None,
 ) -> ContactRecords:
     """Sum the contributions of facets on any rank to each node, and divide by ∫ψ_i. Collective.
 
     The vertices of the side get conditions along its normals, but where the covered share of ∫φ_i
-    is below 1e-6. The gaps are those of the geometry, all conditions are taken to be within reach,
-    and none has friction.
+    is below 1e-6, and where the other side of a pair has them, too, as the tip of a notch: they are
+    no distance apart. The gaps are those of the geometry, all conditions are taken to be within
+    reach, and none has friction.
     """
     owners = dofs.owners_of(integrals.vertices.ravel())
     area = dofs.reduced(owners, integrals.covered.ravel())
     whole = dofs.reduce_on_owners(side.facets.vertices.ravel(), side.areas.ravel())
-    chosen = np.flatnonzero(area > SEARCH.hardly_covered * whole)
+    met = area > SEARCH.hardly_covered * whole
+    if other is not None:
+        vertices = other.facets.vertices.ravel()
+        met &= dofs.reduce_on_owners(vertices, np.ones(len(vertices))) == 0.0
+    chosen = np.flatnonzero(met)
     areas = area[chosen]
     # what rounding of coordinates may make of a gap
     rounding = SEARCH.no_gap * largest(dofs.comm, dofs.V.mesh.geometry.x)
