@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from bodies import clamped, no_load, two_body_problem
+from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import by_point, displacement, integral, measures, problem, relative, solved
@@ -358,3 +360,28 @@ def test_a_missing_last_file(comm, shared_tmp):
     comm.barrier()
     with pytest.raises(InputError, match=r"split_5.msh: no such file; expected one .* 5 partition"):
         tfeti.read_gmsh(shared_tmp / "split.msh", comm)
+
+
+@pytest.mark.parametrize("secondary", ["left face", "right face"])
+def test_the_tip_of_a_notch_bears_nothing(comm, secondary):
+    """It is on both faces: it has no condition, and no force where nothing touches."""
+    if ROOT:
+        geo, names = gmsh.model.geo, ("right", "right face", "left face", "left")
+        corners = (-1, 0), (1, 0), (1, 1), (0.05, 1), (0, 0.5), (0, 1), (-1, 1)
+        points = [geo.addPoint(x, y, 0, 0.2) for x, y in corners]
+        lines = [geo.addLine(a, b) for a, b in zip(points, points[1:] + points[:1], strict=True)]
+        body = geo.addPlaneSurface([geo.addCurveLoop(lines)])
+        geo.mesh.setTransfiniteCurve(lines[3], 6)
+        geo.synchronize()
+        for name, line in zip(names, (lines[k] for k in (1, 3, 4, 6)), strict=True):
+            gmsh.model.addPhysicalGroup(1, [line], name=name)
+        gmsh.model.addPhysicalGroup(2, [body])
+        gmsh.model.mesh.generate(2)
+    d = tfeti.read_gmsh(gmsh.model, comm, 3)
+    way = fem.Constant(d.mesh, (0.0, 0.0))
+    pair = tfeti.Contact("left face", "right face", secondary=secondary, reach=0.2)
+    p = two_body_problem(d, no_load, clamped(d, ("left", way), "right"), [pair])
+    for way.value[0], touches in ((0.01, False), (0.05, True)):
+        force = solved(p).solution.contact(0).resultant.force
+        assert (p.report.contacts[0].touching > 0) == touches
+        assert 0.01 * touches >= np.abs(force[0]) >= 0.003 * touches

@@ -176,10 +176,8 @@ def test_motions_that_nothing_resists_or_drives_are_free():
 
 def test_a_far_tool_falls_until_it_touches():
     scene = block(2)
-    shapes, law = (
-        (ball(2), tfeti.Sphere((0.5, 2.7), 1.0)),
-        {"force": 0.01 * DOWN[2], "free": ("y",)},
-    )
+    shapes = ball(2), tfeti.Sphere((0.5, 2.7), 1.0)
+    law = {"force": 0.01 * DOWN[2], "free": ("y",)}
     found = [solved(scene, tfeti.Obstacle("top", tfeti.RigidBody(s, **law))) for s in shapes]
     ways = [problem.solution.tool(0).displacement[1] for problem in found]
     assert np.isclose(ways[1], ways[0] - 0.7, rtol=1e-9)

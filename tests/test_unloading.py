@@ -235,13 +235,11 @@ def test_a_series_comes_back_to_rest(cell, qp_type, rtol):
 def test_a_wedge_keeps_its_seat_where_friction_locks_it(mu):
     """Between walls that lean by 0.1 it springs out without a load only if μ is less."""
     d = decomposed("quadrilateral", 4, 4)
-    x, walls = d.mesh.geometry.x, {"left": 1.0, "right": -1.0}
+    x, rubs = d.mesh.geometry.x, {"gap": 0.0, "friction": tfeti.Coulomb(mu)}
     x[:, 0] = (x[:, 0] - 0.5) * (1.0 + 0.2 * x[:, 1])
     contacts = [
-        tfeti.Obstacle(
-            side, tfeti.Plane((-0.5 * to, 0), (to, 0.1)), gap=0.0, friction=tfeti.Coulomb(mu)
-        )
-        for side, to in walls.items()
+        tfeti.Obstacle(side, tfeti.Plane((-0.5 * to, 0), (to, 0.1)), **rubs)
+        for side, to in (("left", 1.0), ("right", -1.0))
     ]
     load = fem.Constant(d.mesh, np.zeros(2))
     p = two_body_problem(d, drawn(d, "top", load), lambda V: [], contacts)
