@@ -15,7 +15,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.parallel import least
+from tfeti_dolfinx.common.parallel import any_rank, least
 from tfeti_dolfinx.forms.assembly import Data, Forms
 from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -89,6 +89,7 @@ class NewtonForms(Forms):
 
     Attributes:
         kept: Whether matrix and factors stay as they are, though u changes.
+        repeats: Whether J at the present u is that of the last model: bodies stay elastic.
         known: F(u) where it is known; else None.
         at_model: F(u) of the last load.
     """
@@ -104,6 +105,7 @@ class NewtonForms(Forms):
         places: "CurrentPlaces | None",
     ) -> None:
         self._u, self._places, self.kept = u, places, False
+        self.repeats, self._ready = False, False
         self.known: Array | None = None
         self.at_model: Array = np.zeros(0)
         self._matrix: csr_array | None = None
@@ -116,15 +118,29 @@ class NewtonForms(Forms):
         self._dead = None if dead.empty() else self._compiled(dead, self.names[1])
 
     def changes(self, *kept: str) -> set[str]:
-        """Return what is new, of J nothing where it is kept; a new J makes a new load."""
+        """Return what is new, of J nothing where it is kept; another u makes a new load."""
         found = super().changes(*kept, *(["stiffness"] if self.kept else []))
-        return found | {"load"} if "stiffness" in found else found
+        self.repeats = False
+        if "stiffness" not in found:
+            return found
+        known, comm = self._matrix, self._decomposition.comm
+        if known is not None and self._places is None and "points" not in found:
+            before, self._matrix = known.data.copy(), self.tangent()
+            self._ready = any_rank(comm, not np.array_equal(self._matrix.data, before))
+            self.repeats = not self._ready
+        return (found - {"stiffness"} if self.repeats else found) | {"load"}
 
     def stiffness(self) -> Any:
         """Return this rank's J(u)."""
-        with self._in_place():
-            self._matrix = super().stiffness()
+        if not self._ready:
+            self._matrix = self.tangent()
+        self._ready = False
         return self._matrix
+
+    def tangent(self) -> Any:
+        """Assemble this rank's J(u)."""
+        with self._in_place():
+            return super().stiffness()
 
     def load(self) -> Array:
         """Return this rank's J u − F(u), but for what is rounding: that would drive free bodies.
@@ -178,14 +194,14 @@ class InertialNewtonForms(NewtonForms):
 
     def changes(self, *kept: str) -> set[str]:
         """Return what is new, by inertia, too."""
-        return super().changes(*kept) | self.inertia.changes(self._rest.has_changed())
+        found = self.inertia.changes(self._rest.has_changed())
+        return found | super().changes(*kept)
 
-    def stiffness(self) -> Any:
-        """Return this rank's J/2 + 2M/τ²."""
-        J = super().stiffness()
+    def tangent(self) -> Any:
+        """Assemble this rank's J/2 + 2M/τ²."""
+        J = super().tangent()
         with self._in_place():
-            self._matrix = 0.5 * J + self.inertia.share * self.inertia.M
-        return self._matrix
+            return 0.5 * J + self.inertia.share * self.inertia.M
 
     def residual(self) -> Array:
         """Return this rank's R(u); F(u) before the step has a size."""

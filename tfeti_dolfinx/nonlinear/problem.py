@@ -184,6 +184,7 @@ class NonlinearContactProblem(ContactProblem):
             self._system.forms.kept = not self._finite
         except TfetiError:  # on all ranks
             self._system.forms.kept = False
+            self._system.change("stiffness")
             self._set(begin)
             self._system.tools.go_back()
             self._start = None  # that of a linearised problem is no end of a load step
@@ -206,7 +207,7 @@ class NonlinearContactProblem(ContactProblem):
             if not self._finite and rtol < tol.near * exact:
                 rtol = min(rtol, tol.last * exact)
             try:
-                self._solve_linearised(rtol, warns=step == 0 or rtol <= exact)
+                rtol = self._solve_linearised(rtol, step)
             except (InputError, NoSolutionError) as error:  # of an iterate, not of what was given
                 if step == 0:
                     raise
@@ -298,7 +299,7 @@ class NonlinearContactProblem(ContactProblem):
             / largest(self.decomposition.comm, d)
         )
         before = forms.residual()
-        along = forms.stiffness() @ d
+        along = forms.tangent() @ d
         self._set(u + h * d)
         apart = (forms.residual() - before) / h - along
         off, size = np.sqrt(dot_over(self.decomposition.comm, (apart, apart), (along, along)))
@@ -359,31 +360,35 @@ class NonlinearContactProblem(ContactProblem):
         found = summed(d.comm, sum_rows(at, squares, d.num_bodies * columns))
         return np.sqrt(found.T).reshape(-1, d.num_bodies, columns)
 
-    def _solve_linearised(self, rtol: float, warns: bool) -> None:
-        """Solve the contact problem of the model at u; the last one warns. Collective.
+    def _solve_linearised(self, rtol: float, step: int) -> float:
+        """Solve the contact problem of the model at u; return to what rtol. Collective.
 
-        A kept model without an answer, as its places may hold no body that turns, is made anew.
+        The last one warns. Where the tangent is that of the last model, it is the last but one. A
+        kept model without an answer, as its places may hold no body that turns, is made anew.
         """
         u, again = np.array(self.u.x.array), False
-        given = self._settings.options
-        atol, warns = max(given.atol, self._last_digit), warns and given.warnings
-        self.options = replace(given, rtol=rtol, atol=atol, warnings=warns)
+        given, forms = self._settings.options, self._system.forms
         self._go_to_places()
         try:
             self._system.look_for_changes()
+            rtol = self._exact if forms.repeats else rtol
+            warns = given.warnings and (step == 0 or rtol <= self._exact)
+            atol = max(given.atol, self._last_digit)
+            self.options = replace(given, rtol=rtol, atol=atol, warnings=warns)
             self._solve_in_rounds()
         except TfetiError:  # on all ranks
-            if not self._system.forms.kept:
+            if not forms.kept:
                 raise
-            self._system.forms.kept = self._keeping.kept = False
+            forms.kept = self._keeping.kept = False
             again = True
         finally:
-            self._system.forms.known = None
+            forms.known = None
             if self._places is not None:
                 self._places.back()
-        if again:
-            self._set(u)
-            self._solve_linearised(rtol, warns)
+        if not again:
+            return rtol
+        self._set(u)
+        return self._solve_linearised(rtol, step)
 
     def _go_to_places(self) -> None:
         """Let contact and rigid motions be those of X + u, in finite strain. Collective."""
