@@ -66,7 +66,6 @@ def test_bodies_that_only_touch_have_no_overlap(cell, n, curvatures, sides):
     """Flat, convex and concave sides; a mean with ψ_i, negative somewhere, must not say more."""
     d = bent(cell, *n, *curvatures)
     gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_on(d)).gap)
-    assert len(gaps) > 0
     assert gaps.min() > -1e-12
 
 
@@ -80,8 +79,7 @@ def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
         d.mesh.geometry.x[:, 1] = size * (np.sin(0.3) * x + np.cos(0.3) * y)
         for sides in ORDERS:
             gaps = gathered(searched([sided(*sides)], dofs_on(d)).gap)
-            assert len(gaps) > 0
-            assert np.allclose(gaps, gap * size, rtol=1e-2, atol=0.0)
+            assert np.allclose((gaps.min(), gaps.max()), gap * size, rtol=1e-2, atol=0.0)
 
 
 @pytest.mark.parametrize(
@@ -97,8 +95,7 @@ def test_an_overhanging_wedge(cell, slope):
     n, gdim = 4, 2 if cell in CELLS[:2] else 3
     start = 0.5 if slope < 0.0 else -0.5
     sides = (lambda x: 0.0 * x[:, 0]), (lambda x: slope * (x[:, 0] - start))
-    d = shaped(cell, 3, n, *sides, across=(0.0, 1.15))
-    dofs = dofs_on(d)
+    dofs = dofs_on(shaped(cell, 3, n, *sides, across=(0.0, 1.15)))
     records = searched([sided(*ORDERS[0], reach=0.5)], dofs)
     x = gathered(group_points(dofs)[records.group])[:, 0] - 0.5
     gaps, expected = gathered(records.gap), slope * (x - start)
@@ -173,6 +170,16 @@ def test_the_answer_in_finite_strain_does_not_depend_on_the_path():
     assert apart(*ends) < 1e-6
 
 
+def test_slivers_beyond_a_rim_say_little_of_gaps_in_finite_strain():
+    """The primary side's rim is on a line of nodes; the force is that of a fine mesh."""
+    bowl = (lambda x: 0.0 * x[:, 0]), (lambda x: 0.3 * np.sum((1.5 * x + 0.75) ** 2, axis=1))
+    d = shaped("hexahedron", 3, 4, *bowl, across=(0.0, 2 / 3))
+    d.mesh.geometry.x[:, :2] *= 1.5
+    bcs = clamped(d, "lower bottom", ("upper top", -0.1 * np.eye(3)[2]))
+    p = two_bodies(True, d, bcs, sided(*ORDERS[1], reach=0.4))
+    assert np.isclose(p.solution.contact().resultant.force[2], -0.00855, rtol=0.05)
+
+
 def against_lame(p):
     """Solve; relative error of the mean pressure, and of the pressure in L²."""
     p.solve()
@@ -215,8 +222,7 @@ def test_free_rings_are_solved():
 
 
 def test_the_gap_of_an_obstacle_is_what_is_given():
-    d = decomposed("quadrilateral", 4)
-    plane = tfeti.Plane((0, -0.3), (0, 1))
+    d, plane = decomposed("quadrilateral", 4), tfeti.Plane((0, -0.3), (0, 1))
     for gap, expected in ((0.01, 0.01), (-0.02, -0.02), (lambda x: 0.1 * x[0], None)):
         contacts = [tfeti.Obstacle("bottom", plane, gap=gap)]
         p = solved(problem(d, contacts=contacts, clamped=("top",), loaded="right"))
@@ -232,6 +238,5 @@ def test_the_gap_of_a_pair_is_what_is_given():
     d = stacked("triangle", 3, 4, 4, gap=-0.1)
     dofs = dofs_on(d)
     records = searched([sided(*ORDERS[0], gap=lambda x: x[0] - 0.5)], dofs)
-    x = group_points(dofs)[records.group]
-    assert np.allclose(records.gap, x[:, 0] - 0.5)
+    assert np.allclose(records.gap, group_points(dofs)[records.group][:, 0] - 0.5)
     assert MPI.COMM_WORLD.allreduce(len(records)) == 5

@@ -246,14 +246,16 @@ def _mean_gaps(
 ) -> tuple[Array, Array]:
     """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
 
-    Where nodes have moved there are none, which do not follow u as rows do: Newton's method would
-    close the one from above a step, and of two nodes with that of one point below one is free to
-    go on. Means up to ``rounding`` are 0. Collective.
+    Where nodes have moved there is none but from below beside what is not covered, where a mean
+    may be far off all gaps: bounds do not follow u as rows do. Newton's method would close the one
+    from above a step, and of two nodes with that of one point below one is free to go on. Means up
+    to ``rounding`` are 0. Collective.
     """
     total = dofs.reduced(owners, gap.total.ravel())[chosen]
     low = dofs.reduced(owners, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduced(owners, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
-    mean = np.clip(total / area, low, high) if dofs.nodes is None else total / area
+    bounded = (high == np.inf) | (dofs.nodes is None)
+    mean = np.where(bounded, np.clip(total / area, low, high), total / area)
     return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 
 
