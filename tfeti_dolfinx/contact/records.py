@@ -208,7 +208,7 @@ def conditions(
     gap, spread = _mean_gaps(dofs, owners, integrals.gap, areas, chosen, rounding)
     curved_gap, curved = gap, integrals.curved_gap
     if any_rank(dofs.comm, curved is not integrals.gap):
-        curved_gap, spread = _mean_gaps(dofs, owners, curved, areas, chosen, rounding)
+        curved_gap, spread = _mean_gaps(dofs, owners, curved, areas, chosen, rounding, True)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, integrals.entries)
@@ -242,20 +242,28 @@ def conditions(
 
 
 def _mean_gaps(
-    dofs: TornDofs, owners: Owners, gap: GapIntegrals, area: Array, chosen: Array, rounding: float
+    dofs: TornDofs,
+    owners: Owners,
+    gap: GapIntegrals,
+    area: Array,
+    chosen: Array,
+    rounding: float,
+    curved: bool = False,
 ) -> tuple[Array, Array]:
     """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
 
-    Where nodes have moved there is none but from below beside what is not covered, where a mean
-    may be far off all gaps: bounds do not follow u as rows do. Newton's method would close the one
-    from above a step, and of two nodes with that of one point below one is free to go on. Means up
-    to ``rounding`` are 0. Collective.
+    Bounds do not follow u as rows do. So where nodes have moved there is none from above: Newton's
+    method would close that gap a step. Nor from below on ``curved`` gaps: of two nodes with that of
+    one point one would be free to go on. But beside what is not covered a mean may be far off all
+    gaps. Means up to ``rounding`` are 0. Collective.
     """
     total = dofs.reduced(owners, gap.total.ravel())[chosen]
     low = dofs.reduced(owners, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduced(owners, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
-    bounded = (high == np.inf) | (dofs.nodes is None)
-    mean = np.where(bounded, np.clip(total / area, low, high), total / area)
+    least, most = low, high
+    if dofs.nodes is not None:
+        least, most = np.where(curved & (high < np.inf), -np.inf, low), np.full(len(high), np.inf)
+    mean = np.clip(total / area, least, most)
     return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 
 
