@@ -257,8 +257,9 @@ class Tools:
             if contacts[i].gap == GEOMETRY and overlap[i] > SEARCH.inside * self._sizes[body]:
                 raise InputError(
                     f"{self.bodies[body].name} is inside of {contacts[i].surfaces[0]!r} at the "
-                    f"start, {overlap[i]:.4g} deep; expected a rigid body outside, or touching "
-                    "(gap= says what else is meant, as a press fit)"
+                    f"start, {overlap[i]:.4g} deep; expected a rigid body outside, or touching, "
+                    "that displacement= or force= presses in (in small strain gap= may give an "
+                    "interference, as of a press fit)"
                 )
 
     def check_nodes(self, contact: Array) -> None:
