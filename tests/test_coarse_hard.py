@@ -67,3 +67,12 @@ def test_what_cancels_along_a_tangent_leaves_no_rounding(comm):
     gram = Grams(csr_array(Gt), np.arange(2), comm).of_face(slips).toarray()
     expected = comm.size * (way @ Gt).T @ (way @ Gt)
     assert np.all(np.abs(gram - expected) <= 1e-10 * np.abs(expected))
+
+
+def test_what_rounding_of_slipping_rows_holds_is_free(comm):
+    """A motion that a free row and a tangent hold by rounding, a row that is not free by 1."""
+    Gt = np.array([[1.0, 1e-17], [0.5, 1e-17], [0.2, 0.0], [0.0, 1.0]])
+    way, status = np.array([[1.0, 0.0]]), np.array([Status.FREE, *2 * [Status.SLIP], Status.OPEN])
+    slips = Face(status == Status.FREE, status, np.array([[1, 2]]), way, np.zeros(1))
+    gram = Grams(csr_array(Gt), np.arange(1, 4), comm).of_face(slips).toarray()
+    assert np.allclose(gram, comm.size * np.diag([1.25, 0.0]), rtol=1e-15, atol=0.0)

@@ -81,10 +81,6 @@ class Grams:
             data += damping * self.whole.data
         gram = copy(self._like)  # with the same pattern, which is not looked at again
         gram.data = data
-        held = gram.diagonal() > self._unheld
-        if not np.all(held):
-            both = np.repeat(held, np.diff(gram.indptr)) & held[gram.indices]
-            gram.data = np.where(both, data, 0.0)
         if tangents:
             count, width = face.tangents.shape
             each = rows_of(self.Gt, face.tangent_rows.ravel(), face.tangents.ravel())
@@ -92,6 +88,10 @@ class Grams:
             along = each._replace(indptr=each.indptr[::width], shape=(count, size)).csr()
             along.sum_duplicates()
             gram = gram + replicated((along.T @ along).tocsr(), self.comm)
+        held = gram.diagonal() > self._unheld
+        if not np.all(held):
+            both = np.repeat(held, np.diff(gram.indptr)) & held[gram.indices]
+            gram.data = np.where(both, gram.data, 0.0)
         return gram
 
 
