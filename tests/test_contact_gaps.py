@@ -87,11 +87,7 @@ def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
     [("triangle", 0.02), ("quadrilateral", -0.02), ("tetrahedron", -0.02), ("hexahedron", 0.02)],
 )
 def test_an_overhanging_wedge(cell, slope):
-    """The last facets hang over an edge, where the wedge closes to nothing or opens.
-
-    Beside the edge the gap goes on as it was if it opens; if it closes it would become an overlap
-    with nothing.
-    """
+    """Over an edge the gap goes on if it opens; one that closes would overlap with nothing."""
     n, gdim = 4, 2 if cell in CELLS[:2] else 3
     start = 0.5 if slope < 0.0 else -0.5
     sides = (lambda x: 0.0 * x[:, 0]), (lambda x: slope * (x[:, 0] - start))
@@ -171,13 +167,13 @@ def test_the_answer_in_finite_strain_does_not_depend_on_the_path():
 
 
 def test_slivers_beyond_a_rim_say_little_of_gaps_in_finite_strain():
-    """The primary side's rim is on a line of nodes; the force is that of a fine mesh."""
+    """The primary side's rim is on a line of nodes; the force is nearly that of a fine mesh."""
     bowl = (lambda x: 0.0 * x[:, 0]), (lambda x: 0.3 * np.sum((1.5 * x + 0.75) ** 2, axis=1))
     d = shaped("hexahedron", 3, 4, *bowl, across=(0.0, 2 / 3))
     d.mesh.geometry.x[:, :2] *= 1.5
     bcs = clamped(d, "lower bottom", ("upper top", -0.1 * np.eye(3)[2]))
-    p = two_bodies(True, d, bcs, sided(*ORDERS[1], reach=0.4))
-    assert np.isclose(p.solution.contact().resultant.force[2], -0.00855, rtol=0.05)
+    p = two_bodies(True, d, bcs, sided(*ORDERS[1], gap="curved", reach=0.4))
+    assert np.isclose(p.solution.contact().resultant.force[2], -0.00855, rtol=0.15)
 
 
 def against_lame(p):

@@ -62,10 +62,7 @@ def test_the_mass_of_a_ring_is_that_of_its_radius(shared_tmp):
     ("cell", "below", "stabilised"), [("triangle", True, True), ("tetrahedron", False, False)]
 )
 def test_the_energy_changes_by_what_was_done(cell, below, stabilised):
-    """In each step, through an impact and after it, under a load that changes.
-
-    What contact takes is its force times the gap that it closes, λᵀ(g − Bu).
-    """
+    """Through an impact, under a load that changes; contact takes λᵀ(g − Bu), g − Bu it closes."""
     scene = Thrown(cell, 3, below=below, stabilised=stabilised, weight=0.02)
     comm, gaps, impacts, most = scene.problem.decomposition.comm, None, 0, 0.0
     for n in range(12):
@@ -130,10 +127,7 @@ def test_momentum_changes_by_forces_of_contact():
 
 
 def test_friction_slows_down_what_slides():
-    """Given friction on a plane that holds the box down: it loses bound · area in each second.
-
-    Slips count from where box and plane are at the start.
-    """
+    """On a plane that holds it down it loses bound · area a second; slips count from the start."""
     bound, speed = 0.01, 0.2
     given = {"gap": 0.0, "friction": tfeti.Tresca(bound), "nu": 0.0, "weight": 0.05}
     scene = Thrown("quadrilateral", 4, **given, thrown=(0.0, speed, 0.0), begin=-1.0)

@@ -16,10 +16,7 @@ SUBDOMAINS = 4
 
 
 def solved(contact=True, n=4, **options):
-    """Solver, factorisations of a subdomain, multiplications by S and displacement.
-
-    Of a clamped block of subdomains that do not share their factors.
-    """
+    """Of a clamped block: solver, factorisations of a subdomain, multiplications by S, and u."""
     obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.2)] if contact else []
     d = decomposed("hexahedron", n, SUBDOMAINS)
     p = problem(d, contacts=obstacles, tfeti_local_type="implicit", **options)
