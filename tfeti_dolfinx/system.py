@@ -149,6 +149,8 @@ class System(Generic[OwnForms]):
         changes = self.forms.changes() | self.tools.read(self.time)
         for what in (name for name in CHANGES if name in changes):
             self.change(what)
+        if self.forms.repeats:  # assembled, too
+            self._made["stiffness"] += 1
         comm, given = self._dofs.comm, list(self.bcs)
         if "points" in changes:
             self._ends = None

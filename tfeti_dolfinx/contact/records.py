@@ -208,7 +208,7 @@ def conditions(
     gap, spread = _mean_gaps(dofs, owners, integrals.gap, areas, chosen, rounding)
     curved_gap, curved = gap, integrals.curved_gap
     if any_rank(dofs.comm, curved is not integrals.gap):
-        curved_gap, spread = _mean_gaps(dofs, owners, curved, areas, chosen, rounding, True)
+        curved_gap, spread = _mean_gaps(dofs, owners, curved, areas, chosen, rounding, curved=True)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, integrals.entries)
@@ -260,10 +260,9 @@ def _mean_gaps(
     total = dofs.reduced(owners, gap.total.ravel())[chosen]
     low = dofs.reduced(owners, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduced(owners, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
-    least, most = low, high
-    if dofs.nodes is not None:
-        least, most = np.where(curved & (high < np.inf), -np.inf, low), np.full(len(high), np.inf)
-    mean = np.clip(total / area, least, most)
+    moved = dofs.nodes is not None
+    least = np.where(moved & curved & (high < np.inf), -np.inf, low)
+    mean = np.clip(total / area, least, np.inf if moved else high)
     return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 
 

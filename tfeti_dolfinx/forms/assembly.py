@@ -59,10 +59,13 @@ class Forms:
         rounding: What rounding may have made of each entry of the last load, if that is more than
             a share of it; else None.
         given_loads: Then the part of that load that is given, and known but for its own rounding.
+        repeats: Whether the last look for changes has assembled a matrix with the entries of the
+            one before, as of bodies that stay elastic.
     """
 
     rounding: Array | None = None
     given_loads: Array
+    repeats: bool = False
     _entries: la.MatrixCSR | None = None
     names: ClassVar[tuple[str, str]] = ("a", "L")
     has_mass: ClassVar[bool] = False

@@ -89,7 +89,6 @@ class NewtonForms(Forms):
 
     Attributes:
         kept: Whether matrix and factors stay as they are, though u changes.
-        repeats: Whether J at the present u is that of the last model: bodies stay elastic.
         known: F(u) where it is known; else None.
         at_model: F(u) of the last load.
     """
@@ -105,7 +104,7 @@ class NewtonForms(Forms):
         places: "CurrentPlaces | None",
     ) -> None:
         self._u, self._places, self.kept = u, places, False
-        self.repeats, self._ready = False, False
+        self._ready = False  # whether the matrix is that of the present u
         self.known: Array | None = None
         self.at_model: Array = np.zeros(0)
         self._matrix: csr_array | None = None
@@ -120,7 +119,7 @@ class NewtonForms(Forms):
     def changes(self, *kept: str) -> set[str]:
         """Return what is new, of J nothing where it is kept; another u makes a new load."""
         found = super().changes(*kept, *(["stiffness"] if self.kept else []))
-        self.repeats = False
+        self.repeats = self._ready = False
         if "stiffness" not in found:
             return found
         known, comm = self._matrix, self._decomposition.comm

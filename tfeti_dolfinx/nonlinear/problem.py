@@ -363,8 +363,9 @@ class NonlinearContactProblem(ContactProblem):
     def _solve_linearised(self, rtol: float, step: int) -> float:
         """Solve the contact problem of the model at u; return to what rtol. Collective.
 
-        The last one warns. Where the tangent is that of the last model, it is the last but one. A
-        kept model without an answer, as its places may hold no body that turns, is made anew.
+        That is the one of the answer where the tangent is that of the last model; the last problem
+        warns. A kept model without an answer, as its places may hold no body that turns, is made
+        anew.
         """
         u, again = np.array(self.u.x.array), False
         given, forms = self._settings.options, self._system.forms
