@@ -163,16 +163,21 @@ def test_other_data_make_what_depends_on_them_alone(scene):
 
 
 def test_another_gap_makes_no_row(pair):
+    """Values of a constant, a function on the mesh or one of points are seen without ``update``."""
     scene, other = pair
-    first = scene.solve()
-    before = first.remaining_gap.copy()
-    name = scene.problem.contacts[0].name
-    scene.problem.update(gap={name: 0.01})
-    second = scene.solve()
-    assert counters(scene.problem.report) == [0] * len(COUNTERS)
-    assert apart(second.u, first.u) > 1e-3
-    other.problem.update(gap={0: 0.01})
-    assert apart(second.u, other.solve().u) <= 1e-8
+    first, mesh = scene.solve(), scene.problem.decomposition.mesh
+    before, name = first.remaining_gap.copy(), scene.problem.contacts[0].name
+    size, field = fem.Constant(mesh, 0.0), fem.Function(fem.functionspace(mesh, ("Lagrange", 1)))
+    for gap in (size, field, lambda x: size.value + 0.0 * x[0]):
+        for value in (0.01, 0.0, 0.01, 0.01):
+            size.value = field.x.array[:] = value
+            if scene.problem.contacts[0].gap is not gap:
+                scene.problem.update(gap={name: gap})
+            other.problem.update(gap={0: value})
+            assert apart(scene.solve().u, other.solve().u) <= 1e-8
+            assert counters(scene.problem.report) == [0] * len(COUNTERS)
+        assert "right side" in scene.problem.report.reused
+    assert apart(scene.problem.solution.u, first.u) > 1e-3
     assert np.array_equal(first.remaining_gap, before)
 
 

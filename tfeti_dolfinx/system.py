@@ -166,8 +166,15 @@ class System(Generic[OwnForms]):
             if old and self._search and self._search.sees(new.kinds != old.kinds):
                 self.change("places")
             self._conditions = given
-        if self._search is not None and self.known_friction is not None:
-            known, friction = self.known_friction, self._search.friction()
+        if self._search is not None:
+            self._look_at_values(self._search)
+
+    def _look_at_values(self, search: ContactSearch) -> None:
+        """See whether gaps and laws of friction have other values at the conditions."""
+        if search.read_gaps():
+            self.change("right side")
+        if (known := self.known_friction) is not None:
+            comm, friction = self._dofs.comm, search.friction()
             if any_rank(comm, not np.array_equal(friction > 0.0, known > 0.0)):
                 self.change("constraints")
             elif any_rank(comm, not np.array_equal(friction, known)):

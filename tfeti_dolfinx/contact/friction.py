@@ -32,6 +32,21 @@ Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function | fem.Co
 NOT_NEGATIVE = Range("a number, 0 or more", lambda value: value >= 0.0)
 
 
+def is_of_points(what: str, value: Any) -> bool:
+    """Return whether a ``Value`` may vary; raise an InputError where it is no scalar one."""
+    if isinstance(value, (fem.Function, fem.Constant)):
+        if value.ufl_shape != ():
+            raise InputError(f"{what} has the shape {value.ufl_shape}; expected a scalar")
+        return True
+    if isinstance(value, ufl.core.expr.Expr):  # which can be called, with points
+        raise InputError(
+            f"{what} is {shown(value)}; expected a number, a function of points of shape (3, n), a "
+            "dolfinx.fem.Constant, or a scalar dolfinx.fem.Function, into which UFL can be "
+            "interpolated"
+        )
+    return callable(value)
+
+
 class FrictionLaw:
     """One or two values of a bound on the tangential traction; where it is 0, points only touch."""
 
@@ -47,16 +62,7 @@ class FrictionLaw:
                 "expected one value, or two and the direction of the first"
             )
         for value in self.values:
-            if isinstance(value, (fem.Function, fem.Constant)):
-                if value.ufl_shape != ():
-                    raise InputError(f"{what} has the shape {value.ufl_shape}; expected a scalar")
-            elif isinstance(value, ufl.core.expr.Expr):  # which can be called, with points
-                raise InputError(
-                    f"{what} is {shown(value)}; expected a number, a function of points of shape "
-                    "(3, n), a dolfinx.fem.Constant, or a scalar dolfinx.fem.Function, into which "
-                    "UFL can be interpolated"
-                )
-            elif not callable(value):
+            if not is_of_points(what, value):
                 checked_number(value, what, NOT_NEGATIVE)
 
     @property
@@ -178,44 +184,43 @@ def friction_values(
     """Bounds or coefficients along tangents, ``(n, gdim - 1)``, 0 without a law. Collective."""
     if friction is None:
         return np.zeros((len(records), dofs.bs - 1))
-    x: Array = np.zeros((len(records), 3))
-    what, columns = f"{name}: {friction.what}", list[Array]()
-    if not all(isinstance(value, Real) for value in friction.values):
-        x = group_points(dofs)[records.group]
-    for value in friction.values:
-        if isinstance(value, fem.Function):  # the mean over torn copies
-            S, dof = dofs.scalar
-            if value.function_space.mesh._cpp_object is not S.mesh._cpp_object:
-                raise InputError(
-                    f"{what} is on another mesh; expected a function on decomposition.mesh, the "
-                    "torn mesh, where decomposition.from_original takes functions"
-                )
-            on_nodes = fem.Function(S)
-            on_nodes.interpolate(value)
-            total = dofs.reduce(on_nodes.x.array[dof], np.add)
-            value = (total / dofs.multiplicity)[records.group]
-        elif isinstance(value, fem.Constant):
-            value = value.value
-        with raised_on_all_ranks(dofs.comm):
-            columns.append(numbers_at(what, value, x, lowest=0.0))
+    what, group = f"{name}: {friction.what}", records.group
+    columns = [values_on(what, value, group, dofs, lowest=0.0) for value in friction.values]
     if len(columns) < dofs.bs - 1:
         columns = columns * (dofs.bs - 1)
     return np.stack(columns, axis=1)
 
 
-def numbers_at(what: str, value: Any, x: Array, lowest: float = -np.inf) -> Array:
-    """Return a number for each point, shape ``(n, 3)``, from what a user gives. Not collective.
+def values_on(
+    what: str, value: Any, group: Array, dofs: TornDofs, lowest: float = -np.inf
+) -> Array:
+    """Return the number that a ``Value`` has at each of these groups of nodes. Collective.
 
-    That is a number, a function of points of shape ``(3, n)``, or an array of their values. Raise
-    an InputError where the function fails, or a number is not finite or below the lowest.
+    Raise an InputError where a function fails or is on another mesh, or a number is not finite or
+    below the lowest.
     """
-    if callable(value):
-        value = values_at(value, x.T, (len(x),), f"{what} at")
-    values = np.array(np.broadcast_to(value, (len(x),)), dtype=float)
-    if np.any(wrong := ~(np.isfinite(values) & (values >= lowest))):
-        expected = FINITE if lowest < 0.0 else NOT_NEGATIVE
-        raise InputError(
-            f"{what} is {values[wrong][0]} at the point {x[wrong][0].tolist()}; expected "
-            f"{expected.text}"
-        )
+    if isinstance(value, fem.Function):  # the mean over torn copies
+        S, dof = dofs.scalar
+        if value.function_space.mesh._cpp_object is not S.mesh._cpp_object:
+            raise InputError(
+                f"{what} is on another mesh; expected a function on decomposition.mesh, the torn "
+                "mesh, where decomposition.from_original takes functions"
+            )
+        on_nodes = fem.Function(S)
+        on_nodes.interpolate(value)
+        total = dofs.reduce(on_nodes.x.array[dof], np.add)
+        value = (total / dofs.multiplicity)[group]
+    elif isinstance(value, fem.Constant):
+        value = value.value
+    x = np.zeros((len(group), 3)) if isinstance(value, Real) else group_points(dofs)[group]
+    with raised_on_all_ranks(dofs.comm):
+        if callable(value):
+            value = values_at(value, x.T, (len(x),), f"{what} at")
+        values = np.array(np.broadcast_to(value, (len(x),)), dtype=float)
+        if np.any(wrong := ~(np.isfinite(values) & (values >= lowest))):
+            expected = FINITE if lowest < 0.0 else NOT_NEGATIVE
+            raise InputError(
+                f"{what} is {values[wrong][0]} at the point {x[wrong][0].tolist()}; expected "
+                f"{expected.text}"
+            )
     return values

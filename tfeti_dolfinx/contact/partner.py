@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from numbers import Real
 from typing import Self, TypeAlias
 
 import numpy as np
 
-from tfeti_dolfinx.common.arrays import Array, ArrayLike
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, least
 from tfeti_dolfinx.common.validation import checked_type, is_whole, shown
-from tfeti_dolfinx.contact.friction import FrictionLaw, numbers_at, with_friction
+from tfeti_dolfinx.contact.friction import (
+    FrictionLaw,
+    Value,
+    is_of_points,
+    values_on,
+    with_friction,
+)
 from tfeti_dolfinx.contact.records import ContactRecords, Side, conditions, relative_motion
 from tfeti_dolfinx.contact.rigid_body import Law, RigidBody
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
@@ -39,7 +45,7 @@ from tfeti_dolfinx.mortar.multipliers import with_held_vertices
 from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
-Gap: TypeAlias = str | float | Callable[[Array], ArrayLike]
+Gap: TypeAlias = "str | Value"
 # what the geometry has for a gap: the distance of facets, or of the smooth surfaces through them
 GEOMETRY, CURVED = "geometry", "curved"
 Held: TypeAlias = Prescribed | None  # what Dirichlet conditions prescribe; None: nothing
@@ -120,8 +126,7 @@ class ContactPartner(ABC):
             return records.curved_gap
         if self.gap == GEOMETRY:
             return records.geometric_gap
-        with raised_on_all_ranks(dofs.comm):
-            given = numbers_at(f"{self.name}: gap", self.gap, group_points(dofs)[records.group])
+        given = values_on(f"{self.name}: gap", self.gap, records.group, dofs)
         return np.where(records.geometric_gap <= depth, given, records.geometric_gap)
 
     def _with_gaps_and_friction(
@@ -136,10 +141,11 @@ class ContactPartner(ABC):
         gap = self.gap
         number = isinstance(gap, Real) and not isinstance(gap, bool) and np.isfinite(float(gap))
         known = isinstance(gap, str) and gap in (GEOMETRY, CURVED)
-        if not (number or callable(gap) or known):
+        if not (number or known or is_of_points(f"{self.name}: gap", gap)):
             raise InputError(
                 f'{self.name}: gap={gap!r}, expected "geometry", "curved", a finite length '
-                "(negative: interference), or a function of points of shape (3, n)"
+                "(negative: interference), a dolfinx.fem.Constant or Function of lengths, or a "
+                "function of points of shape (3, n)"
             )
 
 
@@ -217,7 +223,8 @@ class Obstacle(ContactPartner):
         displacement: Of the shape: short for a ``RigidBody`` with this law.
         gap: "geometry" for the shape's distance from the vertices, where straight facets do not
             show ("curved" is the same); or what replaces it, however far the shape is (negative:
-            interference): a number, or a function of the vertices, shape ``(3, n)``.
+            interference): a number, a function of the vertices, shape ``(3, n)``, a DOLFINx
+            constant, or a scalar DOLFINx function on the torn mesh. ``solve`` sees new values.
         friction: ``Tresca``, ``Coulomb``, or None.
         reach: Nodes farther than this from the obstacle get no constraint at first. After the solve
             all are checked, and those that came to overlap get theirs. Default: 5 % of the
@@ -380,8 +387,8 @@ class Contact(ContactPartner):
             facets are so large that the other covers less than 2 % around each node.
         gap: "geometry" for the distance between the facets; "curved" for that between smooth
             surfaces fitted to straight facets, as pins and bearings need it; or what replaces the
-            distance where it is at most the reach (negative: interference): a number, or a
-            function of the secondary surface's vertices, shape ``(3, n)``.
+            distance where it is at most the reach (negative: interference), as for an ``Obstacle``,
+            at the secondary surface's vertices.
         friction: ``Tresca``, ``Coulomb``, or None.
         reach: Surfaces farther apart than this make no constraints at first; those that overlap
             after the solve get theirs, and the solve goes on. Default: 5 % of the smaller

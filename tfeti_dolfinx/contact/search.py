@@ -103,12 +103,30 @@ class ContactSearch:
         ``take_in_overlapping``, as ever. Raise an InputError where a gap does not fit, or that of
         the geometry overlaps too deep; nothing has changed then.
         """
-        contacts, records = list(self.contacts), list(self._records)
+        contacts = list(self.contacts)
         for i, gap in gaps.items():
             contacts[i] = contacts[i].with_gap(gap)
+        self._take_gaps(contacts, gaps)
+        self.contacts = contacts
+
+    def read_gaps(self) -> bool:
+        """Take the values that functions have as gaps now; return whether one is new.
+
+        Raise as ``set_gaps``.
+        """
+        varying = [i for i, contact in enumerate(self.contacts) if callable(contact.gap)]
+        return bool(varying) and self._take_gaps(self.contacts, varying)
+
+    def _take_gaps(self, contacts: Sequence[ContactPartner], which: Iterable[int]) -> bool:
+        """Take gaps of some contacts as they are now; return whether one is new."""
+        records, changed = list(self._records), False
+        for i in which:
             values = contacts[i].gaps(self._dofs, records[i], self._depths[i])
             records[i] = self._from_origin(i, replace(records[i], gap=values))
-        self.contacts, self._records = contacts, records
+            changed |= not np.array_equal(records[i].gap, self._records[i].gap)
+        if changed := any_rank(self._dofs.comm, changed):
+            self._records = records
+        return changed
 
     def rows(self) -> KnownRows:
         """Return the rows that conditions have."""
