@@ -181,6 +181,23 @@ def test_another_gap_makes_no_row(pair):
     assert np.array_equal(first.remaining_gap, before)
 
 
+def test_shapes_that_take_other_values_are_seen():
+    """A function that a user has given may depend on what changes; contacts stay those given."""
+    below = np.zeros(1)
+    shape = tfeti.SignedDistance(
+        lambda x: x[1] - below[0], lambda x: [0.0 * x[0], 1.0 + 0.0 * x[0]]
+    )
+    given = decomposed("triangle", 4, 4), (0.0, -0.05), [tfeti.Obstacle("bottom", shape)]
+    p, q = (problem(*given, rtol=1e-10) for _ in range(2))
+    p.solve()
+    below[:] = -0.01
+    assert apart(solved(p).solution.u, solved(q).solution.u) <= 1e-8
+    assert p.report.searches == 1
+    assert solved(p).report.searches == 0
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        p.contacts[0] = q.contacts[0]
+
+
 def test_other_forms_and_conditions(pair):
     scene, other = pair
     first = scene.solve()

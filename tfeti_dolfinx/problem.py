@@ -417,7 +417,7 @@ class ContactProblem:
         if load is not None:
             forms.replace_load(load)
         if gap is not None:
-            self._system.set_gaps(gaps_by_position(self.contacts, gap))
+            self.contacts = self._system.set_gaps(gaps_by_position(self.contacts, gap))
         self._system.forms = forms
         self.bcs[:] = self.bcs if conditions is None else conditions
 

@@ -76,12 +76,12 @@ class System(Generic[OwnForms]):
         self,
         forms: OwnForms,
         bcs: Sequence[fem.DirichletBC],
-        contacts: list[ContactPartner],
+        contacts: Sequence[ContactPartner],
         dofs: TornDofs,
         settings: Settings,
         method: SubdomainMethod | None = None,
     ) -> None:
-        self.forms, self.bcs, self._contacts = forms, bcs, contacts
+        self.forms, self.bcs, self._contacts = forms, bcs, list(contacts)
         self._dofs, self._settings = dofs, settings
         self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)
@@ -170,7 +170,9 @@ class System(Generic[OwnForms]):
             self._look_at_values(self._search)
 
     def _look_at_values(self, search: ContactSearch) -> None:
-        """See whether gaps and laws of friction have other values at the conditions."""
+        """See whether shapes, gaps and laws of friction are others at the conditions."""
+        if search.shapes_have_changed():
+            self.change("places")
         if search.read_gaps():
             self.change("right side")
         if (known := self.known_friction) is not None:
@@ -193,10 +195,11 @@ class System(Generic[OwnForms]):
                 self._equals.keep(self._subdomains.blocks)
             self._destroy_subdomains()
 
-    def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
-        """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
+    def set_gaps(self, gaps: Mapping[int, Gap]) -> tuple[ContactPartner, ...]:
+        """Give contacts, by position, another ``gap=``, and return all contacts as they are then.
 
-        Raise an InputError where a gap does not fit, or overlaps too deep. Nothing has changed.
+        Conditions stay, but for their gaps. Raise an InputError where a gap does not fit, or
+        overlaps too deep; nothing has changed then.
         """
         contacts = {i: self._contacts[i].with_gap(gap) for i, gap in gaps.items()}
         if self._search is not None:
@@ -204,6 +207,7 @@ class System(Generic[OwnForms]):
         for i, contact in contacts.items():
             self._contacts[i] = contact
         self.change("right side")
+        return tuple(self._contacts)
 
     def begin_at(self, rest: Array, known: tuple[ContactRecords, Array] | None = None) -> None:
         """Let a load step begin at a displacement in primal order.

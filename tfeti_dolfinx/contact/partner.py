@@ -181,14 +181,14 @@ def gaps_by_position(
     return found
 
 
-def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
-    """Return the contacts as a list; raise an InputError unless they are obstacles and pairs."""
+def checked_contacts(contacts: Sequence[ContactPartner]) -> tuple[ContactPartner, ...]:
+    """Return the contacts; raise an InputError unless they are obstacles and pairs."""
     if not isinstance(contacts, Sequence):
         raise InputError(f"contacts: expected a list, got {shown(contacts)}")
     for contact in contacts:
         if not isinstance(contact, ContactPartner):
             raise InputError(f"contacts: expected obstacles and pairs, got {shown(contact)}")
-    return list(contacts)
+    return tuple(contacts)
 
 
 def check_together(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:

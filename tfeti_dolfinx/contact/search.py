@@ -10,12 +10,17 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, summed
 from tfeti_dolfinx.contact.friction import friction_values
-from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
+from tfeti_dolfinx.contact.partner import ContactPartner, Gap, Obstacle, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
+from tfeti_dolfinx.contact.rigid_body import RigidBody
+from tfeti_dolfinx.contact.shapes import distance_and_gradient
+from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh
 from tfeti_dolfinx.contact.tools import Tools
+from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.forms.assembly import Data
 from tfeti_dolfinx.forms.dirichlet import Prescribed
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import diameter
+from tfeti_dolfinx.mortar.facets import diameter, group_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # how far was searched in each contact, and the owned groups whose nodes have rows
@@ -64,6 +69,14 @@ class ContactSearch:
         self._records = [self._from_origin(i, records) for i, (_, records) in enumerate(settled)]
         # beside the conditions that they were found with, some up to a larger reach
         self._wide: dict[int, tuple[ContactRecords, ContactRecords, float]] = {}
+        fixed = (RigidBody, SurfaceMesh)  # a law moves the one, nothing the other
+        self._own_shapes = [
+            (contact.name, contact.shape, records.group)
+            for contact, records in zip(self.contacts, self._records, strict=True)
+            if isinstance(contact, Obstacle) and not isinstance(contact.shape, fixed)
+        ]
+        self._shapes = Data(self._of_shapes, dofs.comm)
+        self.shapes_have_changed()  # from here on
 
     @cached_property
     def _nodes(self) -> list[list[Array]]:
@@ -127,6 +140,24 @@ class ContactSearch:
         if changed := any_rank(self._dofs.comm, changed):
             self._records = records
         return changed
+
+    def shapes_have_changed(self) -> bool:
+        """Return whether shapes of obstacles are others at the nodes than when last asked.
+
+        A function that a user has given may depend on what changes. Raise an InputError where it
+        fails.
+        """
+        return bool(self._own_shapes) and self._shapes.has_changed()
+
+    def _of_shapes(self) -> list[Array]:
+        """Return distances and gradients of shapes at nodes of their surfaces."""
+        points = group_points(self._dofs)
+        with raised_on_all_ranks(self._dofs.comm):
+            found = [
+                distance_and_gradient(shape, points[group], name)
+                for name, shape, group in self._own_shapes
+            ]
+        return [array for both in found for array in both]
 
     def rows(self) -> KnownRows:
         """Return the rows that conditions have."""
