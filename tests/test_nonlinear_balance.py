@@ -100,8 +100,7 @@ def test_a_block_that_only_friction_held_is_let_go_at_once(n, comm):
 
 def test_moments_balance_about_where_bodies_are(comm):
     """A block drawn over a plane and turned: forces act at X + u."""
-    parts = [("upper", (0.0, 0.0), (2.0, 1.0), (6, 3))]
-    decomposition = torn_boxes("triangle", parts, 3)
+    decomposition = torn_boxes("triangle", [("upper", (0.0, 0.0), (2.0, 1.0), (6, 3))], 3)
     way, conditions = moving(decomposition)
     plane = tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0))
     ground = tfeti.Obstacle("upper bottom", plane, friction=tfeti.Coulomb(0.3))
@@ -115,14 +114,17 @@ def test_moments_balance_about_where_bodies_are(comm):
     assert abs(held.moment[2]) > 0.01
 
 
-def test_newtons_method_has_the_side_that_the_other_covers_wholly(comm):
-    parts = [("lower", (0.0, 0.0, 0.0), (1.0, 1.0, 0.5), (4, 3, 2))]
-    parts += [("upper", (0.25, 0.25, 0.5), (0.75, 0.75, 0.8), (3, 3, 1))]
-    d = torn_boxes("hexahedron", parts, 2)
-    held = clamped(d, "lower bottom", ("upper top", np.array([5e-3, 0.0, -0.02])))
-    p = solved(hyperelastic(d, held, tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.2))))
-    assert p.solution.contacts[0].surfaces[0] == "upper bottom"
-    assert p.report.newton_steps <= 20
+@pytest.mark.parametrize("secondary", ["auto", PAIR[0]])
+def test_newtons_method_ends_where_facets_are_covered_in_part(secondary, comm):
+    """A block pressed into a wider one and drawn; "auto" is the side that is covered wholly."""
+    parts = [("lower", (0.0, 0.0, 0.0), (1.0, 1.0, 0.5), (4, 4, 1))]
+    parts += [("upper", (0.25, 0.25, 0.5), (0.7, 0.7, 1.0), (3, 3, 1))]
+    d = torn_boxes("hexahedron", parts, 4)
+    way = fem.Constant(d.mesh, (0.0, 0.0, -0.1))
+    pair = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.3), secondary=secondary)
+    p = hyperelastic(d, clamped(d, "lower bottom", ("upper top", way)), pair)
+    assert all(accepted(p).newton_steps <= 20 for way.value[0] in (0.0, 0.1))
+    assert p.solution.contacts[0].surfaces[0] == PAIR[secondary == "auto"]
 
 
 ENDS = (("left", 1), ("right", 0))  # of a quarter ring, and what is held there

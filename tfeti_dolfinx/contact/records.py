@@ -253,15 +253,15 @@ def _mean_gaps(
     """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
 
     Bounds do not follow u as rows do. So where nodes have moved there is none from above: Newton's
-    method would close that gap a step. Nor from below on ``curved`` gaps: of two nodes with that of
-    one point one would be free to go on. But beside what is not covered a mean may be far off all
-    gaps. Means up to ``rounding`` are 0. Collective.
+    method would close that gap a step. Nor from below on ``curved`` gaps, as of two nodes with that
+    of one point one would be free to go on, and beside what is not covered, where steps would go to
+    and fro. Means up to ``rounding`` are 0. Collective.
     """
     total = dofs.reduced(owners, gap.total.ravel())[chosen]
     low = dofs.reduced(owners, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduced(owners, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
     moved = dofs.nodes is not None
-    least = np.where(moved & curved & (high < np.inf), -np.inf, low)
+    least = np.where(moved & (curved | (high == np.inf)), -np.inf, low)
     mean = np.clip(total / area, least, np.inf if moved else high)
     return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 

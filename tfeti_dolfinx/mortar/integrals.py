@@ -166,13 +166,16 @@ class MortarIntegrals:
 
 
 def integrate(
-    kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments
+    kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments, enough: float
 ) -> MortarIntegrals:
-    """Return integrals of the secondary facets' multipliers over segments."""
+    """Return integrals over segments of the secondary facets' multipliers.
+
+    They are dual ones on facets that are covered by a share that is enough.
+    """
     at = segments.points
     corners, near = segments.corners, near_held(kind, secondary, primary, segments)
     weight = segments.weight * radii(kind, secondary, at.secondary, at.xi)
-    dual = facet_multipliers(kind, secondary, at.secondary, at.xi, weight, near)
+    dual = facet_multipliers(kind, secondary, at.secondary, at.xi, weight, near, enough)
     if np.any(secondary.held) and np.any(primary.held):
         corner, *held = held_by_both(kind, secondary, primary, corners, dual.facet)
         dual, used = dual.with_points(kind, *held)

@@ -83,25 +83,34 @@ class FacetMultipliers:
 
 
 def facet_multipliers(
-    kind: FacetKind, of: Facets, facet: Array, xi: Array, weight: Array, near: Array
+    kind: FacetKind,
+    of: Facets,
+    facet: Array,
+    xi: Array,
+    weight: Array,
+    near: Array,
+    enough: float = SEARCH.hardly_covered,
 ) -> FacetMultipliers:
     """Multipliers on a facet's part with points: hats if it is near what is held, else dual ones.
 
     Those are biorthogonal to the hats, ψ = D_e M_e⁻¹ φ with D_e = diag ∫φ_i and M_e = ∫φ_i φ_j
     there. Both sum up to 1, so a uniform pressure is met (Wohlmuth, SIAM J. Numer. Anal. 38, 2000;
     Cichosz, Bischoff, Comput. Methods Appl. Mech. Eng. 200, 2011). A facet that is hardly covered,
-    by its area, has no share. Points have their facet, reference coordinates of shape ``(m, tdim)``
-    and a weight; ``near`` has flags of each facet's vertices.
+    by its area, has no share; below the share ``enough`` dual ones pass into hats. Points have
+    their facet, reference coordinates of shape ``(m, tdim)`` and a weight; ``near`` has flags of
+    each facet's vertices.
     """
     facets, place = np.unique(facet, return_inverse=True)
     hats = kind.hats.values(xi)
     covered = sum_rows(place, weight[:, None] * hats, len(facets))
     mass = sum_rows(place, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
     area = of.area[facets] * radii(kind, of, facets, np.full((len(facets), xi.shape[1]), 0.5))
-    hardly = covered.sum(axis=1) <= SEARCH.hardly_covered * area
+    share = covered.sum(axis=1) / area
+    hardly = share <= SEARCH.hardly_covered
     mass[hardly] = np.eye(kind.hats.size)
     covered[hardly] = 0.0
-    dual = covered[:, :, None] * np.linalg.inv(mass)
+    part = np.minimum(share / enough, 1.0)[:, None, None]
+    dual = part * covered[:, :, None] * np.linalg.inv(mass) + (1.0 - part) * np.eye(kind.hats.size)
     dual[np.any(near[facets], axis=1) & ~hardly] = np.eye(kind.hats.size)
     psi = np.einsum("mij,mj->mi", dual[place], hats)
     shares = np.zeros(mass.shape)
