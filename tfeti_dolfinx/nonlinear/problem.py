@@ -484,13 +484,17 @@ class NonlinearContactProblem(ContactProblem):
         Raises:
             InputError: As there, or a load or a stiffness is given, or a gap in finite strain.
         """
-        if load is not None or stiffness is not None:
-            raise InputError(
-                "update: load and stiffness are those of linear problems; expected constants and "
-                "functions in F that change"
-            )
-        if gap is not None and self._finite:
-            raise InputError("update: gaps in finite strain are those of the places; expected none")
+        with agreeing(self.decomposition.comm, "update") as given:
+            given |= {"load": load, "stiffness": stiffness, "gap": gap}
+            if load is not None or stiffness is not None:
+                raise InputError(
+                    "update: load and stiffness are those of linear problems; expected constants "
+                    "and functions in F that change"
+                )
+            if gap is not None and self._finite:
+                raise InputError(
+                    "update: gaps in finite strain are those of the places; expected none"
+                )
         super().update(values=values, gap=gap)
 
     def accept(self) -> None:

@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
+from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.contact.records import mean_of_copies, relative_displacement
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.errors import InputError
@@ -246,13 +246,6 @@ class ContactDynamics(ContactProblem):
         lumped: bool = False,
         **others: Any,
     ) -> None:
-        for contact in checked_contacts(contacts):
-            shape = getattr(contact, "shape", None)
-            if isinstance(shape, RigidBody) and shape.free:
-                raise InputError(
-                    f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which "
-                    "knows no mass of it; expected displacement= or rotation= without free="
-                )
         self._stabilised, self._lumped = stabilised, lumped
         self._mass, self._velocity = mass, velocity
         self._with_thickness = others.get("thickness", 1.0)
@@ -276,6 +269,13 @@ class ContactDynamics(ContactProblem):
         flags = {"stabilised": self._stabilised, "lumped": self._lumped}
         for name, flag in flags.items():
             checked_flag(flag, name)
+        for contact in self.contacts:
+            shape = getattr(contact, "shape", None)
+            if isinstance(shape, RigidBody) and shape.free:
+                raise InputError(
+                    f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which "
+                    "knows no mass of it; expected displacement= or rotation= without free="
+                )
         return {**flags, "mass": self._mass, "velocity": self._velocity}
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
