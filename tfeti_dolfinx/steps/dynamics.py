@@ -223,7 +223,7 @@ class ContactDynamics(ContactProblem):
     Attributes:
         u: The displacement at the end of the step.
 
-    ``report.motion`` has energies and work of the last step, see ``work.balance``, and
+    ``report.motion`` has energies and work of the last step, see ``balance``, and
     ``report.contact_forces`` the resultants on the contacts.
 
     Raises:
