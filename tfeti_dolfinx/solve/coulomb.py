@@ -80,7 +80,6 @@ class FixedPointStatus:
 def solve_with_friction(
     dual: Dual,
     options: Options,
-    qp_type: str,
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
     goal: ErrorTarget | None = None,
@@ -96,7 +95,7 @@ def solve_with_friction(
     """
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
         dual.bound_friction(None)  # there may have been coefficients
-        solved = solve_dual(dual, options, qp_type, start, monitor, goal, make_rule)
+        solved = solve_dual(dual, options, start, monitor, goal, make_rule)
         slides = _slides(dual, *solved, None, parameters.slips)
         return *solved, FixedPointStatus(slides=slides, looks=solved[1].looks)
     least = options.number if goal is None else parameters.with_target * options.friction_rtol
@@ -115,10 +114,9 @@ def solve_with_friction(
         asked = least if law else rtol
         exact = goal if asked <= least else None
         # how exact the first of the law has to be a look tells
-        limited = replace(options, max_it=0) if law and aim == np.inf else options
-        result, rule = solve_dual(
-            dual, limited, qp_type, law or start, monitor, exact, make_rule, rtol=asked
-        )
+        max_it = 0 if law and aim == np.inf else options.max_it
+        limited = replace(options, rtol=asked, max_it=max_it)
+        result, rule = solve_dual(dual, limited, law or start, monitor, exact, make_rule)
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         reached = parameters.looser * rule.tolerance
         # Step 2: without an answer other bounds, or more steps of Newton's method

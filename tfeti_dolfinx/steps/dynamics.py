@@ -170,7 +170,7 @@ class Predictor:
                 if self.rows_and_start[0] is gluing:
                     dual.know(self.rows_and_start[1], self.image)
             self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
-            result, accuracy = solve_dual(dual, options, options.qp_type, start)
+            result, accuracy = solve_dual(dual, options, start)
             self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
             self.last = result.lam.copy(), result.face
             self.multiplications = dual.F.count
