@@ -248,7 +248,6 @@ class ContactDynamics(ContactProblem):
     ) -> None:
         self._stabilised, self._lumped = stabilised, lumped
         self._mass, self._velocity = mass, velocity
-        self._with_thickness = others.get("thickness", 1.0)
         super().__init__(a, L, bcs, contacts, decomposition, **others)
         self._system.how.mixed = False  # many solves come
         if self.options.rtol == "auto":
@@ -286,7 +285,7 @@ class ContactDynamics(ContactProblem):
         if isinstance(mass, ufl.Form) and self._lumped:
             raise InputError("lumped=True with a form of the mass; expected a density")
         if not isinstance(mass, ufl.Form):
-            mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
+            mass = mass_form(mass, V, self.decomposition, self._thickness, self._lumped)
         return mass
 
     def take_step(self, size: float) -> None:
