@@ -21,9 +21,8 @@ def stack():
         tfeti.Obstacle("lower bottom", tfeti.Plane((0, -1), (0, 1))),
         tfeti.Contact("lower top", "upper bottom", name="joint"),
     ]
-    p = two_body_problem(d, pressed(d), held(d, "lower left", "upper left"), contacts, rtol=1e-10)
-    p.solve()
-    return p.solution
+    bcs = held(d, "lower left", "upper left")
+    return solved(two_body_problem(d, pressed(d), bcs, contacts, rtol=1e-10)).solution
 
 
 def test_contacts_by_name_and_by_position(stack):

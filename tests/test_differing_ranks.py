@@ -13,7 +13,7 @@ import ufl
 from dolfinx import fem
 from moving import Thrown
 from mpi4py import MPI
-from scenes import box, clamp, decomposed, forms, hooke
+from scenes import box, clamp, decomposed, forms, hooke, solved
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.agreement import agreeing, described
@@ -27,10 +27,7 @@ COMM = MPI.COMM_WORLD
 # on one rank nobody is odd
 ODD = 0 < COMM.rank == COMM.size - 1
 UP = tfeti.Plane((0, -0.01), (0, 1))
-
-
-def floor(**given):
-    return tfeti.Obstacle("bottom", UP, **given)
+floor = partial(tfeti.Obstacle, "bottom", UP)
 
 
 class Scene:
@@ -54,9 +51,7 @@ class Scene:
         return tfeti.ContactProblem(self.a, L or self.load(), bcs, list(contacts), self.d, **others)
 
     def solved(self, **given):
-        problem = self.problem(**given)
-        problem.solve()
-        return problem
+        return solved(self.problem(**given))
 
 
 def contacts(usual, odd):
@@ -154,23 +149,25 @@ def of_solution(usual, odd=None):
     return do
 
 
-def on_another_mesh(s, folder):
-    other = Scene()
-    s.problem().update(stiffness=other.a if ODD else s.a)
-
-
 def a_field_on_one(s, folder):
     problem = s.solved()
     (s.d.to_original if ODD else s.d.locate_facets)(problem.u if ODD else of_side)
 
 
-def nonlinear(**given):
+def nonlinear(load_on_one=False, **given):
     def do(s, folder):
-        u, held = fem.Function(s.V), [s.held()]
-        F = ufl.action(s.a, u) - s.load()
-        tfeti.NonlinearContactProblem(F, u, held, [floor()], s.d, **given).solve()
+        u, held, L = fem.Function(s.V), [s.held()], s.load()
+        F = ufl.action(s.a, u) - L
+        problem = tfeti.NonlinearContactProblem(F, u, held, [floor()], s.d, **given)
+        problem.update(load=L if load_on_one and ODD else None)
+        problem.solve()
 
     return do
+
+
+def free_body_on_one(s, folder):
+    body = tfeti.RigidBody(UP, free=("y",) if ODD else ())
+    tfeti.ContactDynamics(s.a, s.load(), [], [tfeti.Obstacle("bottom", body)], s.d, mass=1.0)
 
 
 def of_side(x):
@@ -210,9 +207,7 @@ CASES = {
         rf"bcs\[0\]: value\[0\] is 0.01{ON}0.0 on rank 0",
     ),
     "a file of another name on one": (
-        lambda s, folder: write_xdmf(
-            folder / ("b.xdmf" if ODD else "a.xdmf"), s.solved(stress=hooke()).solution
-        ),
+        lambda s, folder: write_xdmf(folder / f"{'ab'[ODD]}.xdmf", s.solved().solution),
         rf"path is '.*b.xdmf'{ON}'.*a.xdmf' on rank 0",
     ),
     "a picture of another contact on one": (pictured, rf"contact is 1{ON}0 on rank 0"),
@@ -241,12 +236,17 @@ CASES = {
         of_solution(lambda of: of.at([[0.5, 0.5]]), lambda of: of.at([[0.5, 0.5], [0.6, 0.5]])),
         rf"the number of points is 2{ON}1 on rank 0",
     ),
-    "a form of another mesh on one": (on_another_mesh, "the space is on another mesh"),
+    "a form of another mesh on one": (
+        lambda s, folder: s.problem().update(stiffness=(s.a, Scene().a)[ODD]),
+        "the space is on another mesh",
+    ),
     "a field on one": (a_field_on_one, rf"rank \d has called to_original {WHERE} locate_facets"),
     "tolerances of Newton's method on one": (
         nonlinear(tolerances=tfeti.NewtonTolerances(max_it=9 if ODD else 8)),
         rf"tolerances: max_it is 9{ON}8 on rank 0",
     ),
+    "a load of a nonlinear problem on one": (nonlinear(load_on_one=True), "load and stiffness are"),
+    "a free rigid body on one": (free_body_on_one, "a RigidBody with free motions in a Contact"),
     "an update that raises on one": (nonlinear(update=lambda: 1 / (not ODD)), "update: ZeroDiv"),
     "a law of another value on one": (
         contacts(*[[floor(displacement=lambda t: (0.0, 0.02 if ODD else 0.01))]] * 2),

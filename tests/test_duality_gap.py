@@ -54,7 +54,7 @@ def exact(p):
     """The displacement of the same program, bounds of friction included, as exact as can be."""
     start = (p.solution.lam, np.zeros(p.dual.coarse.dimension))
     options = replace(p.options, rtol=1e-13, qp_type="newton", error_if_not_converged=False)
-    result, rule = solve_dual(p.dual, options, "newton", start)
+    result, rule = solve_dual(p.dual, options, start)
     return rule.u
 
 

@@ -5,7 +5,7 @@ import pytest
 import ufl
 from bodies import TO_ROUNDING, held, stacked
 from dolfinx import fem
-from scenes import box, decomposed, integral, largest, roller, vectors
+from scenes import box, decomposed, integral, largest, roller, solved, vectors
 
 import tfeti_dolfinx as tfeti
 
@@ -35,8 +35,7 @@ def compressed(d, elastic, degree=1, contacts=(), on="top", sides=("left", "bott
         thickness=elastic.thickness,
         petsc_options={**TO_ROUNDING, **options},
     )
-    problem.solve()
-    return problem
+    return solved(problem)
 
 
 def uniaxial(model, x, nu=POISSON):

@@ -288,9 +288,7 @@ class ContactProblem:
                 goal = goal_of(self._given_stress, self.dofs, self._thickness)
             given, own = self._settings, self._settings.extensions
             with added_options(given.prefix, given.factor_options):  # of faces, and of a late S
-                solved = solve_with_friction(
-                    dual, options, options.qp_type, start, own.monitor, goal, own.stopping
-                )
+                solved = solve_with_friction(dual, options, start, own.monitor, goal, own.stopping)
         result, accuracy, settling = solved
         state, lam = accuracy.recovered, result.lam.copy()
         self._let_go = np.zeros(0, dtype=bool)

@@ -265,17 +265,17 @@ class Obstacle(ContactPartner):
 
         At the first search the shape has to fit: later the surface may have turned away from it.
         """
-        facets = self._facets(dofs)
         if stiffness is not None and dofs.bs > 1:  # else the gradient's first component counts
-            self._check_shape(dofs, facets)
-        return self, self._conditions(dofs, contact, facets, reach, held)
+            self._check_shape(dofs)
+        return self, self.records(dofs, contact, reach, reach, held)
 
     def _facets(self, dofs: TornDofs) -> Facets:
         """Return the facets of the surface on this rank."""
         return local_facets(dofs, dofs.decomposition.facets(self.surface), facet_kind(dofs))
 
-    def _check_shape(self, dofs: TornDofs, facets: Facets) -> None:
+    def _check_shape(self, dofs: TornDofs) -> None:
         """Raise an InputError unless the gradient is the distance's and a facet faces the shape."""
+        facets = self._facets(dofs)
         centres, size = facets.corners.mean(axis=1), diameter(dofs.decomposition)
         check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
@@ -289,19 +289,13 @@ class Obstacle(ContactPartner):
     def records(
         self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Held = None
     ) -> ContactRecords:
-        """One condition per vertex of the surface, from its present distance. Collective."""
-        return self._conditions(dofs, contact, self._facets(dofs), reach, held)
-
-    def _conditions(
-        self, dofs: TornDofs, contact: int, facets: Facets, reach: float, held: Held
-    ) -> ContactRecords:
-        """One condition per vertex of these facets. Collective.
+        """One condition per vertex of the surface, from its present distance. Collective.
 
         With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex (or the gap that is
         given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
         n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
-        kind = facet_kind(dofs)
+        kind, facets = facet_kind(dofs), self._facets(dofs)
         corners = facets.corners
         with raised_on_all_ranks(dofs.comm):
             distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)

@@ -150,13 +150,11 @@ def scaled_rows(B: PETSc.Mat, weights: Array) -> PETSc.Mat:
     return scaled
 
 
-def dirichlet_preconditioner(
-    B: PETSc.Mat, subdomains: Subdomains, volume: float = CHOICE.volume
-) -> DualOperator:
+def dirichlet_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
     """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; with a metric if sparse. Collective.
 
-    From (λ + 2μ)/μ of ``volume`` on what is inside has to follow a trace, and in space in tangents,
-    some of whose cells yield and keep their volumes.
+    From (λ + 2μ)/μ of ``CHOICE.volume`` on what is inside has to follow a trace, and in space in
+    tangents, some of whose cells yield and keep their volumes.
     """
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     metric, comm = None, subdomains.comm
@@ -165,7 +163,7 @@ def dirichlet_preconditioner(
             block.bs
             for block in sparse
             if (subdomains.tangents and block.bs == 3)
-            or block.stiffness.stretch_over_shear > volume
+            or block.stiffness.stretch_over_shear > CHOICE.volume
         ]
         rigid = sum(len(block.trace_dofs) for block in subdomains.blocks[len(sparse) :])
         near = partial(near_stiffness, sparse, rigid) if any_rank(comm, bool(stiff)) else None

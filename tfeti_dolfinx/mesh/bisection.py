@@ -1,7 +1,6 @@
 """Recursive coordinate bisection of points that ranks share, along layers of cells."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -29,21 +28,10 @@ class BisectionParameters:
 PARAMETERS = BisectionParameters()
 
 
-class _Halves(NamedTuple):
-    """Plan of a halving of all parts.
-
-    Attributes:
-        wanted: Number of points on the left, shape ``(p,)``.
-        may: By how many points that may change, shape ``(p,)``.
-        axes: The axis that is cut across first, then those that ties are broken by, ``(p, gdim)``.
-        gap: Distance of layers along these axes, shape ``(p, gdim)``; -1 in parts without flat
-            cells; None if there are none at all.
-    """
-
-    wanted: Array
-    may: Array
-    axes: Array
-    gap: Array | None
+# of a halving of all parts: numbers of points on the left, ``(p,)``; by how many these may change,
+# ``(p,)``; the axis that is cut across first, then those that ties are broken by, ``(p, gdim)``;
+# the distance of layers along these axes, ``(p, gdim)``, -1 in parts without flat cells, or None
+Halves = tuple[Array, Array, Array, Array | None]
 
 
 def bisect_points(
@@ -84,7 +72,7 @@ def bisect_points(
 
 def _halves(
     grid: Array, sizes: Array | None, part: Array, targets: tuple[Array, Array], comm: MPI.Intracomm
-) -> _Halves:
+) -> Halves:
     """Plan the halving of parts; targets: numbers of final parts in each, and in its left half."""
     (whole, left), gdim = targets, grid.shape[1]
     box = np.full((2, len(whole), gdim), np.iinfo(np.int64).max)  # of x and of -x
@@ -111,17 +99,18 @@ def _halves(
     wanted = np.rint(count * left / whole)
     spare = np.minimum(wanted - left, (count - wanted) - (whole - left))  # a point for each part
     may = np.minimum(np.maximum(PARAMETERS.moved * count / whole, 1.0), spare)
-    return _Halves(wanted, may, axes, gap)
+    return wanted, may, axes, gap
 
 
-def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Array:
+def _after(grid: Array, part: Array, halves: Halves, comm: MPI.Intracomm) -> Array:
     """Return whether points come after the cut of their part.
 
     A cut that goes through a layer moves to one of its ends if few points change sides by that;
     else it is made inside the layer along the next axis, where it may lie between columns.
     """
-    num_parts, gdim = halves.axes.shape
-    digits, bits = np.take_along_axis(grid, halves.axes[part], axis=1), 62 // gdim
+    wanted, may, axes, gaps = halves
+    num_parts, gdim = axes.shape
+    digits, bits = np.take_along_axis(grid, axes[part], axis=1), 62 // gdim
     result, before = np.zeros(len(grid), dtype=bool), np.zeros(num_parts, dtype=np.int64)
     inside = np.arange(len(grid))  # points of layers that cuts go through
     for k in range(gdim):
@@ -129,19 +118,19 @@ def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Ar
         key = np.zeros(len(own), dtype=np.int64)
         for axis in range(k, gdim):
             key = (key << bits) | digits[inside, axis]
-        kth = _kth_smallest(key, own, halves.wanted - before, comm)
+        kth = _kth_smallest(key, own, wanted - before, comm)
         result[inside] = key > kth[own]
-        if halves.gap is None or k == gdim - 1 or np.all(halves.gap < 0):
+        if gaps is None or k == gdim - 1 or np.all(gaps < 0):
             break
-        at, gap = kth >> (bits * (gdim - 1 - k)), halves.gap[:, k]
+        at, gap = kth >> (bits * (gdim - 1 - k)), gaps[:, k]
         low, is_low = _end_of_layer(c, own, at, gap, comm)
         high, is_high = _end_of_layer(-c, own, -at, gap, comm)
         same = (PARAMETERS.same_place * gap).astype(np.int64)
         ends = np.stack((low - same - 1, same - high))  # the largest coordinates on the left
         left = np.stack([before + sizes_of(own[c <= end[own]], num_parts, comm) for end in ends])
-        off = np.where([is_low, is_high], np.abs(left - halves.wanted), np.inf)
+        off = np.where([is_low, is_high], np.abs(left - wanted), np.inf)
         better, parts = np.argmin(off, axis=0), np.arange(num_parts)
-        moves = (gap >= 0) & (off[better, parts] <= halves.may)
+        moves = (gap >= 0) & (off[better, parts] <= may)
         result[inside] = np.where(moves[own], c > ends[better, parts][own], result[inside])
         through = ((gap >= 0) & is_low & is_high & ~moves)[own]
         inside = inside[through & (c > ends[0][own]) & (c <= ends[1][own])]

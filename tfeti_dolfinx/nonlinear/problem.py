@@ -14,6 +14,7 @@ from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sum_rows, sums
 from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
+from tfeti_dolfinx.contact.records import mean_of_copies
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     InputError,
@@ -281,8 +282,7 @@ class NonlinearContactProblem(ContactProblem):
         if not self._finite:
             return end
         dofs, subdomains = self.dofs, self._system.subdomains
-        sums = dofs.reduce(dofs.to_primal(end).reshape(-1, dofs.bs), np.add)
-        end = dofs.to_dolfinx(dofs.spread(sums / dofs.multiplicity[:, None]))
+        end = dofs.to_dolfinx(dofs.spread(mean_of_copies(dofs, dofs.to_primal(end))))
         if not np.any(self._let_go):
             return end
         bodies = self._system.dual.coarse.bodies
@@ -484,13 +484,17 @@ class NonlinearContactProblem(ContactProblem):
         Raises:
             InputError: As there, or a load or a stiffness is given, or a gap in finite strain.
         """
-        if load is not None or stiffness is not None:
-            raise InputError(
-                "update: load and stiffness are those of linear problems; expected constants and "
-                "functions in F that change"
-            )
-        if gap is not None and self._finite:
-            raise InputError("update: gaps in finite strain are those of the places; expected none")
+        with agreeing(self.decomposition.comm, "update") as given:
+            given |= {"load": load, "stiffness": stiffness, "gap": gap}
+            if load is not None or stiffness is not None:
+                raise InputError(
+                    "update: load and stiffness are those of linear problems; expected constants "
+                    "and functions in F that change"
+                )
+            if gap is not None and self._finite:
+                raise InputError(
+                    "update: gaps in finite strain are those of the places; expected none"
+                )
         super().update(values=values, gap=gap)
 
     def accept(self) -> None:

@@ -37,7 +37,7 @@ class FrictionParameters:
     rounding: float = 1e-16  # of a residual: no λ that has it comes lower
 
 
-DEFAULT = FrictionParameters()
+PARAMETERS = FrictionParameters()
 
 # --- The law ----------------------------------------------------------------------------------
 
@@ -122,9 +122,7 @@ class LawProgram:
 # --- Newton's method --------------------------------------------------------------------------
 
 
-def newton_on_law(
-    program: LawProgram, at: LawPoint, target: float, parameters: FrictionParameters = DEFAULT
-) -> tuple[LawPoint | None, int]:
+def newton_on_law(program: LawProgram, at: LawPoint, target: float) -> tuple[LawPoint | None, int]:
     """Solve the natural map of Coulomb's law by a semismooth Newton method. Collective.
 
     Alart, Curnier, Comput. Methods Appl. Mech. Engrg. 92 (1991); Hüeber, Stadler, Wohlmuth, SIAM J.
@@ -134,38 +132,38 @@ def newton_on_law(
     and the steps taken.
     """
     best, idle, past = np.inf, 0, list[float]()
-    for step in range(parameters.max_steps):
+    for step in range(PARAMETERS.max_steps):
         # Step 1: the natural map: what a gradient step, brought back, moves, and what Gλ lacks
         feasible, p, residual = program.natural_map(at)
         if residual <= target:
             return at, step
-        idle = 0 if residual < parameters.progress * best else idle + 1
+        idle = 0 if residual < PARAMETERS.progress * best else idle + 1
         best = min(best, residual)
-        if idle > parameters.patience or not parameters.rounding * residual <= target:
+        if idle > PARAMETERS.patience or not PARAMETERS.rounding * residual <= target:
             return None, step
         # Step 2: the face of p, and what follows where points slip
         face = feasible.face(p, at.s)
         on = OnFace(face, program.law.following(p, face), p)
         # Step 3: the system there
-        share = parameters.reduction
+        share = PARAMETERS.reduction
         if past:
-            share = min(share, parameters.followed * residual / past[-1])
+            share = min(share, PARAMETERS.followed * residual / past[-1])
         try:
-            end = _solved_on_face(program, on, at, share, target, parameters)
+            end = _solved_on_face(program, on, at, share, target)
         except FactorError:
             return None, step + 1
         # Step 4: halve the step until its residual is none of the largest; F is known on all of it
-        past = [*past[1 - parameters.memory :], residual]
+        past = [*past[1 - PARAMETERS.memory :], residual]
         part, there = 1.0, end
         while not program.natural_map(there)[2] <= max(past):
             part *= 0.5
-            if part <= parameters.shortest:
+            if part <= PARAMETERS.shortest:
                 there = end
                 break
             ends = (at.lam, end.lam), (at.s, end.s), (at.mu, end.mu)
             there = LawPoint(*((1.0 - part) * a + part * b for a, b in ends))
         at = there
-    return None, parameters.max_steps
+    return None, PARAMETERS.max_steps
 
 
 # --- The system of a step ---------------------------------------------------------------------
@@ -193,12 +191,11 @@ def _solved_on_face(
     at: LawPoint,
     share: float,
     target: float,
-    parameters: FrictionParameters,
 ) -> LawPoint:
     """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0, Gλ = e on a face, λ = λ₁ + (I + C)u, but for a share."""
     qp, comm = program.qp, program.qp.coarse.comm
     # t/√w in the place of t: what bends hard takes over no step, and is there to balance loads
-    w = np.maximum(1.0, on.face.curvature / (parameters.hard * program.norm))
+    w = np.maximum(1.0, on.face.curvature / (PARAMETERS.hard * program.norm))
     scaled = replace(on.face, tangents=(on.face.tangents.T / np.sqrt(w)).T)
     oblique = program.oblique(scaled, on.C)
     M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
@@ -217,7 +214,7 @@ def _solved_on_face(
     way = lam + on.C.followed(u) - at.lam
     basis = known_on(qp.recycled, on, oblique.project)
     size = program.norm * norm_over(comm, way)
-    if size > parameters.unseen * target:
+    if size > PARAMETERS.unseen * target:
         # Step 3b: F of the way, if it can be seen
         image = qp.F(way)
         s = s + image
@@ -225,9 +222,9 @@ def _solved_on_face(
             qp.recycled.keep(way, image)
     # Step 3c: conjugate residuals
     b = -oblique.project(s + on.face.bend(u))
-    goal = max(share * norm_over(comm, b), parameters.followed * target)
+    goal = max(share * norm_over(comm, b), PARAMETERS.followed * target)
     known = basis.shape[1]
-    z, image, basis = gcr(apply, precondition, b, goal, basis, comm, parameters)
+    z, image, basis = gcr(apply, precondition, b, goal, basis, comm)
     u, s = u + z, s + image
     if qp.recycled is not None:
         _, new, images = basis[:, known:]
@@ -253,7 +250,6 @@ def gcr(
     target: float,
     basis: Array,
     comm: MPI.Intracomm,
-    parameters: FrictionParameters = DEFAULT,
 ) -> tuple[Array, Array, Array]:
     """Make ‖b − Au‖ least over more and more directions, from u = 0 on. Collective.
 
@@ -268,7 +264,6 @@ def gcr(
         basis: q = Az, orthonormal over all ranks, z and images of directions to begin with, shape
             ``(3, k, n)``.
         comm: Communicator.
-        parameters: Parameters.
 
     Returns:
         u, its image, and all directions; new ones, each for one multiplication, come last.
@@ -276,7 +271,7 @@ def gcr(
     Q, Z, images = basis
     c = summed(comm, Q @ b)
     u, image, r = c @ Z, c @ images, b - c @ Q
-    size, most = norm_over(comm, r), basis.shape[1] + parameters.max_directions
+    size, most = norm_over(comm, r), basis.shape[1] + PARAMETERS.max_directions
     while size > target and basis.shape[1] < most:
         # Step 1: the preconditioned residual, made orthogonal to all before
         z = precondition(r)
@@ -284,10 +279,10 @@ def gcr(
         sums = summed(comm, np.concatenate((Q @ q, (q @ q, q @ r, r @ r))))
         c, (square, along, left) = sums[:-3], sums[-3:]
         length = float(np.sqrt(max(square - c @ c, 0.0)))
-        step = along / length if length > parameters.new * np.sqrt(square) else 0.0
+        step = along / length if length > PARAMETERS.new * np.sqrt(square) else 0.0
         after = float(np.sqrt(max(left - step**2, 0.0)))
         length, step, after = (float(x) for x in steering(comm, length, step, after))
-        if abs(step) <= parameters.gain * size:
+        if abs(step) <= PARAMETERS.gain * size:
             break
         # Step 2: the least residual along it
         new = np.stack((q - c @ Q, z - c @ Z, w - c @ images)) / length
@@ -298,9 +293,7 @@ def gcr(
     return u, image, basis
 
 
-def known_on(
-    past: Recycled | None, on: OnFace, project: Callable[[Array], Array], new: float = DEFAULT.new
-) -> Array:
+def known_on(past: Recycled | None, on: OnFace, project: Callable[[Array], Array]) -> Array:
     """Return known products Au = P(F(I + C)u + κu) from directions WN = (I + C)U of past solves.
 
     Farhat, Crivelli, Roux (``Recycled``); as Carvalho, Gratton, Lago, Vasseur, SIAM J. Sci. Comput.
@@ -319,6 +312,6 @@ def known_on(
     U, FU = U @ N, FW @ N
     AU = project(FU + on.face.bend(U))
     sizes, Vt = right_singular(past.comm, AU)
-    kept = sizes > new * sizes[0]
+    kept = sizes > PARAMETERS.new * sizes[0]
     T = Vt[kept].T / sizes[kept]
     return np.stack([(X @ T).T for X in (AU, U, FU)])

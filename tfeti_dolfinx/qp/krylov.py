@@ -70,7 +70,6 @@ class PcpgParameters:
     # of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else conjugate
     # gradients begin anew
     drifted: float = 0.5
-    short: float = 1e-6  # of λ: a way that is shorter may be rounding of Gλ = e
     # whether a direction is made conjugate to all before it, not to the last alone
     keeps: bool = True
 
@@ -98,13 +97,9 @@ class Directions:
         most = max(parameters.numbers // (2 * max(rows, 1)), 1) if parameters.keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
-    def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
-        """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding.
-
-        Of a short step, which may be rounding of Gλ = e, F makes far too much to learn ‖F‖ from.
-        """
-        if not short:
-            self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
+    def seen(self, pFp: float, pp: float) -> bool:
+        """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding."""
+        self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
         return pFp > self.parameters.flat * self.norm * pp
 
 
@@ -143,7 +138,6 @@ def pcpg(
     given = own.parameters
     recycled, (point, past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
-    least = given.short**2 * qp.dot((point.lam, point.lam))[0]
     while True:
         # test
         small = norm <= rule.tolerance
@@ -175,9 +169,8 @@ def pcpg(
         # ‖r‖², and rank 0's numbers, since loops end by them
         known = (rz, rp, pFp) if comm.rank == 0 else np.zeros(3)
         squared, rz, rp, pFp = summed(comm, np.array([left @ left, *known]))
-        short = bool(pFp) and (rp / pFp) ** 2 * pp < least
         own.helped = max(own.helped, rz / norm**2 if norm > 0.0 else 0.0)
-        if not (own.seen(pFp, pp, short) and rz > given.flat * own.helped * norm**2):
+        if not (own.seen(pFp, pp) and rz > given.flat * own.helped * norm**2):
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break

@@ -60,9 +60,6 @@ class NewtonParameters:
     stage: float = 0.1
     patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
     circle: int = 300  # steps in a row that do not halve ‖g^P‖: q falls by what Gλ = e lacks
-    # of the gradient: multipliers of Gλ = e that make it longer than that are rounding of motions
-    # that a face does not see
-    unfelt: float = 1e6
     lost: float = 2e-15  # of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖
     rounding: float = 1e-10  # of the largest entry of a way: less is none
     hidden: float = 1e-15  # of the terms of q: what its differences may be wrong by
@@ -158,23 +155,14 @@ def growth(coarse: Coarse, lam: Array) -> float:
     return float(c) if c > 0.0 and imbalance(coarse, c * lam) <= HELD else 1.0
 
 
-def multipliers_at(
-    qp: QP, z: Point, on_face: Coarse | None = None, unfelt: float = NewtonParameters.unfelt
-) -> Array:
-    """Return the μ of least squares at λ on a face, 0 where they are rounding. Collective.
+def multipliers_at(qp: QP, z: Point) -> Array:
+    """Return the μ of least squares at λ, on the rows that hold what they multiply. Collective.
 
-    Without a face that of the rows that hold what they multiply there: open rows and those on the
-    boundary of a disc, which slip, do not. Of motions that a face does not see μ is rounding over
-    rounding: it makes the gradient longer than ``unfelt`` times itself.
+    Open rows and those on the boundary of a disc, which slip, do not.
     """
-    if on_face is None:
-        face = qp.feasible.face(z.lam, -z.lam)
-        holds = (face.status == Status.FREE) | (face.holding & (z.lam != 0.0))
-        on_face = qp.coarse.on_face(Face(holds, face.status))
-    mu = on_face.coordinates(z.g)
-    s = z.g - qp.coarse.combined(mu)
-    left, size = qp.dot((s, s), (z.g, z.g))
-    return mu if left <= unfelt**2 * size else 0.0 * mu
+    face = qp.feasible.face(z.lam, -z.lam)
+    holds = (face.status == Status.FREE) | (face.holding & (z.lam != 0.0))
+    return qp.coarse.on_face(Face(holds, face.status)).coordinates(z.g)
 
 
 def seen_norm(qp: QP, z: Point, short: float = NewtonParameters.short) -> float:
@@ -230,7 +218,7 @@ class NewtonIteration:
         directions.norm = directions.norm or seen_norm(qp, z, self.parameters.short)
         self.norm = directions.norm or 1.0
         if self.resume:
-            self.mu = multipliers_at(qp, z, self.solver.coarse, self.parameters.unfelt)
+            self.mu = self.solver.coarse.coordinates(z.g)
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
         self.s = self.z.g - normal(self.mu)
         wanted = self.z.lam - self.s / self.norm
@@ -553,7 +541,7 @@ def newton(
     # Step 0: a feasible start
     z, mu = start.at, np.zeros(qp.coarse.dimension) if start.lam is None else start.mu
     if mu is None:
-        mu = multipliers_at(qp, z, unfelt=parameters.unfelt)
+        mu = multipliers_at(qp, z)
     state = NewtonIteration(qp, solver, parameters, z, mu)
     monitor(steps, "start", z.lam, norm_over(qp.coarse.comm, start.b), 0.0)
     friction = any_rank(qp.coarse.comm, state.pressed.status >= RUBS)

@@ -11,14 +11,8 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.solvability import sliding_motion
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget, MakeRule
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.friction_newton import (
-    DEFAULT,
-    FrictionParameters,
-    Law,
-    LawPoint,
-    LawProgram,
-    newton_on_law,
-)
+from tfeti_dolfinx.qp.friction_newton import PARAMETERS as ON_LAW
+from tfeti_dolfinx.qp.friction_newton import Law, LawPoint, LawProgram, newton_on_law
 from tfeti_dolfinx.qp.newton import growth, multipliers_at, seen_norm
 from tfeti_dolfinx.qp.problem import ConvergedReason, KnownProduct, Monitor, Point, QPResult, Steps
 from tfeti_dolfinx.solve.solver import solve_dual
@@ -28,7 +22,6 @@ from tfeti_dolfinx.solve.solver import solve_dual
 class CoulombParameters:
     """Parameters of a solve with Coulomb's law."""
 
-    newton: FrictionParameters = DEFAULT  # those of Newton's method on the law
     tries: int = 4  # how often that may end and its bounds not be at rest; once where it has failed
     finer: float = 0.03  # factor on its target each time, and at least on its residual
     # its target at most, over the tolerance that a look leaves to a solve. Looks leave half of
@@ -64,6 +57,9 @@ class CoulombParameters:
     slips: float = 1e4
 
 
+PARAMETERS = CoulombParameters()
+
+
 @dataclass(frozen=True)
 class FixedPointStatus:
     """Convergence of the bounds of friction."""
@@ -80,12 +76,10 @@ class FixedPointStatus:
 def solve_with_friction(
     dual: Dual,
     options: Options,
-    qp_type: str,
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
     goal: ErrorTarget | None = None,
     make_rule: MakeRule = Accuracy,
-    parameters: CoulombParameters = CoulombParameters(),
 ) -> tuple[QPResult, Accuracy, FixedPointStatus]:
     """Solve the dual problem with bounds of friction that fit the forces of normals. Collective.
 
@@ -96,14 +90,14 @@ def solve_with_friction(
     """
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
         dual.bound_friction(None)  # there may have been coefficients
-        solved = solve_dual(dual, options, qp_type, start, monitor, goal, make_rule)
-        slides = _slides(dual, *solved, None, parameters.slips)
+        solved = solve_dual(dual, options, start, monitor, goal, make_rule)
+        slides = _slides(dual, *solved, None)
         return *solved, FixedPointStatus(slides=slides, looks=solved[1].looks)
-    least = options.number if goal is None else parameters.with_target * options.friction_rtol
-    tolerance = min(options.friction_rtol, parameters.beside_rtol * least)
-    bounds = FrictionBounds(dual, start, parameters)
-    newton = NewtonOnLaw(dual, options, least, parameters)
-    rtol, change, aim, near = parameters.first, np.inf, np.inf, False
+    least = options.number if goal is None else PARAMETERS.with_target * options.friction_rtol
+    tolerance = min(options.friction_rtol, PARAMETERS.beside_rtol * least)
+    bounds = FrictionBounds(dual, start)
+    newton = NewtonOnLaw(dual, options, least)
+    rtol, change, aim, near = PARAMETERS.first, np.inf, np.inf, False
     steps, looks, iterations = Steps(), 0, 0
     # Step 0: the first bounds: of Newton's method on the law, else those of the start
     law = newton.solve(start, bounds)
@@ -111,16 +105,15 @@ def solve_with_friction(
     while True:
         # Step 1: the problem with these bounds; those of the law are worth all digits
         if law is None:
-            rtol = least if near else max(least, min(rtol, parameters.share * change))
+            rtol = least if near else max(least, min(rtol, PARAMETERS.share * change))
         asked = least if law else rtol
         exact = goal if asked <= least else None
         # how exact the first of the law has to be a look tells
-        limited = replace(options, max_it=0) if law and aim == np.inf else options
-        result, rule = solve_dual(
-            dual, limited, qp_type, law or start, monitor, exact, make_rule, rtol=asked
-        )
+        max_it = 0 if law and aim == np.inf else options.max_it
+        limited = replace(options, rtol=asked, max_it=max_it)
+        result, rule = solve_dual(dual, limited, law or start, monitor, exact, make_rule)
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
-        reached = parameters.looser * rule.tolerance
+        reached = PARAMETERS.looser * rule.tolerance
         # Step 2: without an answer other bounds, or more steps of Newton's method
         if result.reason <= 0:
             if law:
@@ -134,7 +127,7 @@ def solve_with_friction(
             continue
         # Step 3: its forces of normals, beside those that the bounds are of
         change = bounds.change(result.lam)
-        near = change <= parameters.near * tolerance
+        near = change <= PARAMETERS.near * tolerance
         aim = reached * min(1.0, least / asked)  # residuals and errors fall together
         # Step 4: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
@@ -146,24 +139,24 @@ def solve_with_friction(
         # Step 5: the next bounds: of Newton's method on the law, or those forces
         # where nothing was to do the change tells nothing of the error of bounds: finer, first
         moved = law is not None or result.steps.inner > 0
-        rtol *= 1.0 if moved else parameters.share
+        rtol *= 1.0 if moved else PARAMETERS.share
         start = law or (result.lam, result.mu)
         bounds.advance()
         law = newton.solve(start, bounds, aim) if moved else None
         found = bounds.now
         motion = None if law else bounds.hold()
         start = start if bounds.now is found else None  # with other bounds anew
-        restless = bounds.idle > parameters.patience or iterations >= options.friction_max_it
+        restless = bounds.idle > PARAMETERS.patience or iterations >= options.friction_max_it
         if motion is not None or restless:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
     result.steps = steps
-    slides = _slides(dual, result, rule, motion, parameters.slips)
+    slides = _slides(dual, result, rule, motion)
     at_rest = change, tolerance, bounds.body
     return result, rule, FixedPointStatus(iterations, *at_rest, newton.steps, slides, looks)
 
 
-def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, most: float) -> str:
+def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None) -> str:
     """Say that a motion of bodies, else that of u, has no end; "" if it has one. Collective.
 
     Then the result is no answer, and has the rows that slip most. Where friction fails a body may
@@ -174,7 +167,7 @@ def _slides(dual: Dual, result: QPResult, rule: Accuracy, motion: Array | None, 
     if not known and dual.contact_rows[1] and coarse.dimension:
         slip, bends = (np.abs(x) / coarse.row_size for x in (state.gap, state.residual))
         rubs = coarse.rubbing[state.active[coarse.rubbing]]  # what is let go may go anywhere
-        if largest(coarse.comm, slip[rubs]) > most * largest(coarse.comm, bends):
+        if largest(coarse.comm, slip[rubs]) > PARAMETERS.slips * largest(coarse.comm, bends):
             motion = coarse.bodies.part_of(state.u)
     if motion is None:
         return ""
@@ -198,10 +191,8 @@ class FrictionBounds:
         idle: Problems in a row whose change is not half of the least one before.
     """
 
-    def __init__(
-        self, dual: Dual, start: tuple[Array, Array] | None, parameters: CoulombParameters
-    ) -> None:
-        self._dual, self._parameters, self._comm = dual, parameters, dual.coarse.comm
+    def __init__(self, dual: Dual, start: tuple[Array, Array] | None) -> None:
+        self._dual, self._comm = dual, dual.coarse.comm
         constraints, coarse = dual.constraints, dual.coarse
         self._constraints, at = constraints, constraints.pressed
         self._rows = constraints.pressed_by[at]
@@ -221,7 +212,7 @@ class FrictionBounds:
             unknown = np.any(on_loose[tangents[at]], axis=1) & (self._mu > 0.0)
             self.now = np.where(unknown, np.inf, self.now)
         # what ``hold`` and ``turn`` have not tried yet
-        self._others = [*([] if start is None else [np.inf]), *parameters.shares]
+        self._others = [*([] if start is None else [np.inf]), *PARAMETERS.shares]
         self._turns = 2
         self.found = self.now
         self._last: tuple[Array, Array] | None = None  # bounds and forces before these
@@ -287,17 +278,16 @@ class FrictionBounds:
         Body by body, as nodal forces of friction: beside forces elsewhere those on a light one
         would not be seen.
         """
-        parameters = self._parameters
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
         most = max(norm_over(self._comm, values), driving)
         moves_none = float(np.min(self._dual.negligible)) / (self._dual.seen or np.inf)
-        self._none = max(parameters.no_force * most, moves_none)
+        self._none = max(PARAMETERS.no_force * most, moves_none)
         self.found = self.forces_of(values)
         if self.stick:
             return float("inf")
         nothing = np.full(len(self._rows), self._none)
         miss, size, least = map(self._on_bodies, (self.found - self.now, self.found, nothing))
-        lightest = parameters.light * size.max(initial=0.0)
+        lightest = PARAMETERS.light * size.max(initial=0.0)
         size = np.maximum(size, max(least.max(initial=TINY), lightest))
         self.body = int(np.argmax(miss / size))
         miss = np.where(miss > least, miss, 0.0)  # less is rounding
@@ -323,7 +313,7 @@ class FrictionBounds:
         now, found = self.now, self.found
         # forces that fall to less than half again and again, as where slips of earlier steps alone
         # drive, make a geometric series: of its bounds the limit 0 is tried
-        if self._falls == self._parameters.falls and not self.stick:
+        if self._falls == PARAMETERS.falls and not self.stick:
             self.now = np.zeros_like(found)
         else:
             share = 1.0 if self.stick else self._relaxation()
@@ -338,7 +328,7 @@ class FrictionBounds:
         way, turn = now - first, (found - now) - (of_first - first)
         along, size = summed(self._comm, np.array([-(way @ turn), turn @ turn]))
         share = along / size if along > 0.0 else 1.0  # else they run away, to other ones
-        return float(steering(self._comm, np.clip(share, self._parameters.shortest, 1.0))[0])
+        return float(steering(self._comm, np.clip(share, PARAMETERS.shortest, 1.0))[0])
 
     def forces_of(self, lam: Array, none: float = 0.0) -> Array:
         """Return the normal forces, those that are rounding or at most ``none`` set to 0."""
@@ -356,11 +346,9 @@ class FrictionBounds:
 class NewtonOnLaw:
     """Newton's method on the law of a scene, tried until it fails. All methods are collective."""
 
-    def __init__(
-        self, dual: Dual, options: Options, rtol: float, parameters: CoulombParameters
-    ) -> None:
-        self._dual, self._rtol, self._parameters = dual, rtol, parameters
-        self.tries = parameters.tries if options.friction_type == "newton" else 0
+    def __init__(self, dual: Dual, options: Options, rtol: float) -> None:
+        self._dual, self._rtol = dual, rtol
+        self.tries = PARAMETERS.tries if options.friction_type == "newton" else 0
         self.steps, self._share = 0, 1.0
         self._recycled = dual.recycled
         self._before: Array = np.zeros(0)  # bounds before those of the last answer
@@ -390,7 +378,7 @@ class NewtonOnLaw:
         ``bounds`` become those of λ; ``aim`` is what residual an answer must have to be right, as
         far as a look has told. None where it fails, or is not tried, as without a start.
         """
-        dual, parameters = self._dual, self._parameters
+        dual = self._dual
         if start is None or self.tries == 0 or bounds.stick:
             return None
         rows, at = dual.constraints, dual.constraints.pressed
@@ -411,7 +399,7 @@ class NewtonOnLaw:
         # what is made to slip along a row without entries
         drawn = np.any(rows.empty[tangents] & (rows.c[tangents] != 0.0), axis=1)
         reach = np.ones(rows.num_rows)
-        reach[tangents[drawn]] = parameters.reach
+        reach[tangents[drawn]] = PARAMETERS.reach
         program = LawProgram(qp, law, dual.coarse.oblique, norm, reach)
         points = []
         for c in dict.fromkeys((1.0, growth(qp.coarse, start[0]))):
@@ -424,20 +412,20 @@ class NewtonOnLaw:
         first = points[residuals.index(residual)]
         # Step 2: the target
         size = norm_over(qp.coarse.comm, qp.coarse.project(qp.d))
-        target = min(self._share * self._rtol * size, parameters.finer * residual, aim)
+        target = min(self._share * self._rtol * size, PARAMETERS.finer * residual, aim)
         # Step 3: Newton's method
         end, steps = None, 0
         terms = max(norm * norm_over(dual.coarse.comm, start[0]), norm_over(dual.coarse.comm, qp.d))
-        if target > parameters.rounding * terms:
-            end, steps = newton_on_law(program, first, target, parameters.newton)
-        self.steps, self._share = self.steps + steps, parameters.finer * self._share
+        if target > PARAMETERS.rounding * terms:
+            end, steps = newton_on_law(program, first, target)
+        self.steps, self._share = self.steps + steps, PARAMETERS.finer * self._share
         self.tries -= 1
         if end is None:
             self.tries, dual.recycled = min(self.tries, 1), self._recycled
             return None
         # F of the end stands for that of the nearest point of its set, where the problem begins
         Fx = end.s + qp.coarse.combined(end.mu) + qp.d
-        dual.last = KnownProduct(end.lam, Fx, within=parameters.newton.unseen * target / norm)
+        dual.last = KnownProduct(end.lam, Fx, within=ON_LAW.unseen * target / norm)
         # the bounds of multipliers for which the law holds; what cannot be seen bounds none
         self._before, bounds.now = bounds.now, bounds.forces_of(end.lam, dual.last.within)
         dual.bound_friction(bounds.now)

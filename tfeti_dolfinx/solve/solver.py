@@ -92,12 +92,10 @@ def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
 def solve_dual(
     dual: Dual,
     options: Options,
-    qp_type: str,
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
     goal: ErrorTarget | None = None,
     make_rule: MakeRule = Accuracy,
-    rtol: float | None = None,
 ) -> tuple[QPResult, Accuracy]:
     """Solve the dual problem, and look at the answer. Collective.
 
@@ -107,10 +105,10 @@ def solve_dual(
 
     ``start`` are λ on this rank's rows, and the multipliers of Gλ = e, to start from; ``monitor``
     is called after each step, by default as options say; bounds of the algebraic error in energy
-    come down to ``goal``, too; ``rtol`` is by default that of the options. Return multipliers, and
-    the rule, which has their displacement and its measured accuracy.
+    come down to ``goal``, too. Return multipliers, and the rule, which has their displacement and
+    its measured accuracy.
     """
-    cite("tfeti", qp_type)
+    cite("tfeti", qp_type := options.qp_type)
     solver = SOLVERS[qp_type]
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _begin(dual, qp, solver, start)
@@ -123,18 +121,18 @@ def solve_dual(
         )
     if monitor is None and options.monitor:
         monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
-    rtol = options.number if rtol is None else rtol
-    rule = make_rule(dual, rtol, options.atol, (begin.reference, begin.rounding), goal)
+    scale = begin.reference, begin.rounding
+    rule = make_rule(dual, options.number, options.atol, scale, goal)
     own, most = getattr(options, qp_type), options.max_it
     result = solver.solve(qp, begin, rule, own, max_it=most, monitor=monitor or no_monitor)
     rounding = result.reason == ConvergedReason.DIVERGED_ROUNDING
     if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
         late.steps = 0  # K_bb of thin parts spans more digits than S: begin again
-        return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
+        return solve_dual(dual, options, start, monitor, goal, make_rule)
     broken = rounding or result.reason == ConvergedReason.DIVERGED_INDEFINITE_MAT
     if broken and dual.rough is not None:
         dual.rough = None  # what single precision does not tell: begin again with F itself
-        return solve_dual(dual, options, qp_type, start, monitor, goal, make_rule, rtol)
+        return solve_dual(dual, options, start, monitor, goal, make_rule)
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
     if dual.coarse.dimension == 0 or qp_type == "newton":
         # what steps leave out of the gradient does not grow from solve to solve, where a look was

@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
+from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.contact.records import mean_of_copies, relative_displacement
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.errors import InputError
@@ -170,7 +170,7 @@ class Predictor:
                 if self.rows_and_start[0] is gluing:
                     dual.know(self.rows_and_start[1], self.image)
             self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
-            result, accuracy = solve_dual(dual, options, options.qp_type, start)
+            result, accuracy = solve_dual(dual, options, start)
             self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
             self.last = result.lam.copy(), result.face
             self.multiplications = dual.F.count
@@ -223,7 +223,7 @@ class ContactDynamics(ContactProblem):
     Attributes:
         u: The displacement at the end of the step.
 
-    ``report.motion`` has energies and work of the last step, see ``work.balance``, and
+    ``report.motion`` has energies and work of the last step, see ``balance``, and
     ``report.contact_forces`` the resultants on the contacts.
 
     Raises:
@@ -246,16 +246,8 @@ class ContactDynamics(ContactProblem):
         lumped: bool = False,
         **others: Any,
     ) -> None:
-        for contact in checked_contacts(contacts):
-            shape = getattr(contact, "shape", None)
-            if isinstance(shape, RigidBody) and shape.free:
-                raise InputError(
-                    f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which "
-                    "knows no mass of it; expected displacement= or rotation= without free="
-                )
         self._stabilised, self._lumped = stabilised, lumped
         self._mass, self._velocity = mass, velocity
-        self._with_thickness = others.get("thickness", 1.0)
         super().__init__(a, L, bcs, contacts, decomposition, **others)
         self._system.how.mixed = False  # many solves come
         if self.options.rtol == "auto":
@@ -276,6 +268,13 @@ class ContactDynamics(ContactProblem):
         flags = {"stabilised": self._stabilised, "lumped": self._lumped}
         for name, flag in flags.items():
             checked_flag(flag, name)
+        for contact in self.contacts:
+            shape = getattr(contact, "shape", None)
+            if isinstance(shape, RigidBody) and shape.free:
+                raise InputError(
+                    f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which "
+                    "knows no mass of it; expected displacement= or rotation= without free="
+                )
         return {**flags, "mass": self._mass, "velocity": self._velocity}
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
@@ -286,7 +285,7 @@ class ContactDynamics(ContactProblem):
         if isinstance(mass, ufl.Form) and self._lumped:
             raise InputError("lumped=True with a form of the mass; expected a density")
         if not isinstance(mass, ufl.Form):
-            mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
+            mass = mass_form(mass, V, self.decomposition, self._thickness, self._lumped)
         return mass
 
     def take_step(self, size: float) -> None:

@@ -310,7 +310,7 @@ class LoadSteps:
         with agreeing(self._comm, "LoadSteps.write_csv") as given:
             given["path"] = path
             target = checked_path(path, ".csv")
-        axes = "xyz"[: self._problem.decomposition.mesh.geometry.dim]
+        axes = "xyz"[: self._problem.dofs.bs]
         names = [contact.name for contact in self._problem.contacts]
         with raised_on_all_ranks(self._comm), named(f"cannot write {target}", OSError):
             if self._comm.rank == 0:
