@@ -85,11 +85,7 @@ class System(Generic[OwnForms]):
         self._dofs, self._settings = dofs, settings
         self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)
-        # obstacles have normals of their own, and of degree 1 nodes see no others
-        pairs = any(isinstance(contact, Contact) for contact in contacts)
-        self._sees_symmetry = dofs.bs == dofs.V.mesh.geometry.dim and (
-            pairs or (self._has_friction and dofs.V.element.basix_element.degree > 1)
-        )
+        self._sees_symmetry = len(contacts) > 0 and dofs.bs == dofs.V.mesh.geometry.dim
         self.elements = (
             FiniteElements(dofs) if method is None else method.assembly(dofs, dofs.decomposition)
         )

@@ -97,10 +97,11 @@ class CoarseSpace(Coarse):
             sizes[springs] = np.sqrt(own.power(2).sum(axis=1))
         self.row_size = np.where(sizes > 0.0, sizes, 1.0)
         self.bodies = Bodies(subdomains, *names)
-        self.J = self._on_bodies(Gt)
-        # 2. motions that rows leave free: equalities, with soft springs, with contact
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[sets.contact] = False
+        whole, little = self._on_bodies(Gt, equalities)
+        self.J = replace(whole, parts=np.where(little, 0.0, whole.parts))
+        # 2. motions that rows leave free: equalities, with soft springs, with contact
         glues = np.array(equalities)
         glues[springs] = False
         self.unheld = self._unglued = self.unresisted(glues, self.bodies.unsprung)
@@ -119,7 +120,10 @@ class CoarseSpace(Coarse):
         )
         self.motions = self._basis.coordinates
         self.work = self.motions.transposed
-        rows = replace(self.J, parts=self.J.parts * self.row_size[self.J.row, None])
+        # what hardly acts on a body holds none, but forces balance only with it
+        joint = np.isin(whole.body, self.free_motions.joint.nonzero()[0] // self.bodies.k)
+        parts = np.where(little & ~joint[:, None], whole.parts, self.J.parts)
+        rows = replace(self.J, parts=parts * self.row_size[self.J.row, None])
         Gt = self._basis.rows(Gt, rows, glues)
         free = self.free_motions.columns
         null = self.motions.csr() @ free if free.shape[1] else csr_array((dimension, 0))
@@ -143,18 +147,24 @@ class CoarseSpace(Coarse):
         e[np.flatnonzero((basis.unheld & still[:, None])[basis.kept])] = 0.0
         return e
 
-    def _on_bodies(self, Gt: csr_array) -> BodyRows:
-        """Return the rows of B R over their size on motions of bodies, without what is rounding."""
+    def _on_bodies(self, Gt: csr_array, equalities: Array) -> tuple[BodyRows, Array]:
+        """Return the rows of B R over their size on motions of bodies, without what is rounding.
+
+        And flags of parts of contact rows that hardly act on bodies, as between the faces of a
+        closed slit.
+        """
         J = Gt @ self.bodies.motions.csr()
         counts = np.diff(J.indptr)
         row = np.repeat(np.arange(len(counts)), counts)
         J.data /= self.row_size[row]
         largest: Array = np.zeros(len(counts))
         np.maximum.at(largest, row, np.abs(J.data))
-        noise = np.where(largest <= TOLERANCES.gluing, TOLERANCES.gluing, TOLERANCES.no_grip)
+        little = largest <= TOLERANCES.gluing
+        noise = np.where(little & equalities, TOLERANCES.gluing, TOLERANCES.no_grip)
         J.data[np.abs(J.data) <= noise[row]] = 0.0
         J.eliminate_zeros()
-        return BodyRows.of(J, self.bodies.count, self.bodies.k)
+        found = BodyRows.of(J, self.bodies.count, self.bodies.k)
+        return found, little[found.row, None]
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
