@@ -23,6 +23,7 @@ from tfeti_dolfinx.contact.records import (
     mean_of_copies,
     slips,
 )
+from tfeti_dolfinx.contact.rigid_body import has_facets
 from tfeti_dolfinx.contact.search import ContactSearch, KnownRows
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError
@@ -85,7 +86,11 @@ class System(Generic[OwnForms]):
         self._dofs, self._settings = dofs, settings
         self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)
-        self._sees_symmetry = len(contacts) > 0 and dofs.bs == dofs.V.mesh.geometry.dim
+        # other obstacles have normals of their own, and of degree 1 nodes see no others
+        self._sees_symmetry = dofs.bs == dofs.V.mesh.geometry.dim and (
+            any(isinstance(c, Contact) or has_facets(getattr(c, "shape", None)) for c in contacts)
+            or (self._has_friction and dofs.V.element.basix_element.degree > 1)
+        )
         self.elements = (
             FiniteElements(dofs) if method is None else method.assembly(dofs, dofs.decomposition)
         )

@@ -23,9 +23,8 @@ from tfeti_dolfinx.contact.friction import (
     with_friction,
 )
 from tfeti_dolfinx.contact.records import ContactRecords, Side, conditions, relative_motion
-from tfeti_dolfinx.contact.rigid_body import Law, RigidBody
+from tfeti_dolfinx.contact.rigid_body import Law, RigidBody, has_facets
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
-from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.dirichlet import Prescribed
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -307,8 +306,7 @@ class Obstacle(ContactPartner):
         sides = dofs.reduce_on_owners(vertices[at_edge], beside)
         length = np.linalg.norm(sides, axis=1, keepdims=True)
         normals = np.where(length > 0.0, sides / np.where(length > 0.0, length, 1.0), normals)
-        shape = self.shape.shape if isinstance(self.shape, RigidBody) else self.shape
-        if held and held.across is not None and isinstance(shape, SurfaceMesh):
+        if held and held.across is not None and has_facets(self.shape):
             # on a plane of symmetry its facets have the normal of the smooth surface
             inside = np.where(held.across, 0.0, normals)
             share = np.linalg.norm(inside, axis=1, keepdims=True)

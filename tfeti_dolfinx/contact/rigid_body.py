@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
 from tfeti_dolfinx.common.validation import checked_flag, checked_type, checked_vector, named, shown
 from tfeti_dolfinx.contact.shapes import Placed, Point, Shape, check_shape
+from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh
 from tfeti_dolfinx.errors import InputError
 
 # numbers that may change: fixed, a constant of DOLFINx, or a function of the problem's time
@@ -241,3 +242,8 @@ class RigidBody:
         found = checked_vector(given, what, [size], f"{size} finite number(s)")
         # what turns a vector leaves rounding along axes that it is normal to
         return np.where(np.abs(found) > 4.0 * np.spacing(np.abs(found).max()), found, 0.0)
+
+
+def has_facets(shape: Any) -> bool:
+    """Return whether a shape, or that of a rigid body, is a ``SurfaceMesh``."""
+    return isinstance(shape.shape if isinstance(shape, RigidBody) else shape, SurfaceMesh)

@@ -12,9 +12,8 @@ from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over,
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, Obstacle, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
-from tfeti_dolfinx.contact.rigid_body import RigidBody
+from tfeti_dolfinx.contact.rigid_body import RigidBody, has_facets
 from tfeti_dolfinx.contact.shapes import distance_and_gradient
-from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Data
@@ -69,11 +68,12 @@ class ContactSearch:
         self._records = [self._from_origin(i, records) for i, (_, records) in enumerate(settled)]
         # beside the conditions that they were found with, some up to a larger reach
         self._wide: dict[int, tuple[ContactRecords, ContactRecords, float]] = {}
-        fixed = (RigidBody, SurfaceMesh)  # a law moves the one, nothing the other
         self._own_shapes = [
             (contact.name, contact.shape, records.group)
             for contact, records in zip(self.contacts, self._records, strict=True)
-            if isinstance(contact, Obstacle) and not isinstance(contact.shape, fixed)
+            # laws move rigid bodies, and nothing moves a mesh
+            if isinstance(contact, Obstacle)
+            and not (isinstance(contact.shape, RigidBody) or has_facets(contact.shape))
         ]
         self._shapes = Data(self._of_shapes, dofs.comm)
         self.shapes_have_changed()  # from here on
