@@ -518,13 +518,13 @@ class Contact(ContactPartner):
         kind, comm = facet_kind(dofs), dofs.comm
         height, deep = SEARCH.seen * reach, SEARCH.seen * depth
         distance = max(height, deep)
-        enough = SEARCH.hardly_covered if dofs.nodes is None else SEARCH.extrapolated
+        moved, curved = dofs.nodes is not None, self.gap == CURVED
         facing = with_images(sides[1].facets, dofs, held.across if held else None)
         secondary, primary = rendezvous(sides[0].facets, facing, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
-            integrals = integrate(kind, secondary, primary, segments, enough)
+            integrals = integrate(kind, secondary, primary, segments, moved, curved)
         averted = any_rank(comm, segments.averted)
         if averted and count_over(comm, len(segments.weight)) == 0:
             raise InputError(

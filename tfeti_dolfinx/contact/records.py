@@ -208,7 +208,7 @@ def conditions(
     gap, spread = _mean_gaps(dofs, owners, integrals.gap, areas, chosen, rounding)
     curved_gap, curved = gap, integrals.curved_gap
     if any_rank(dofs.comm, curved is not integrals.gap):
-        curved_gap, spread = _mean_gaps(dofs, owners, curved, areas, chosen, rounding, curved=True)
+        curved_gap, spread = _mean_gaps(dofs, owners, curved, areas, chosen, rounding)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, integrals.entries)
@@ -242,27 +242,17 @@ def conditions(
 
 
 def _mean_gaps(
-    dofs: TornDofs,
-    owners: Owners,
-    gap: GapIntegrals,
-    area: Array,
-    chosen: Array,
-    rounding: float,
-    curved: bool = False,
+    dofs: TornDofs, owners: Owners, gap: GapIntegrals, area: Array, chosen: Array, rounding: float
 ) -> tuple[Array, Array]:
     """∫ψ_i g / ∫ψ_i of groups within the bounds on g, as ψ_i may be negative, and their width.
 
-    Bounds do not follow u as rows do. So where nodes have moved there is none from above: Newton's
-    method would close that gap a step. Nor from below on ``curved`` gaps, as of two nodes with that
-    of one point one would be free to go on, and beside what is not covered, where steps would go to
-    and fro. Means up to ``rounding`` are 0. Collective.
+    Bounds do not follow u as rows do: where nodes have moved, there are none. Means up to
+    ``rounding`` are 0. Collective.
     """
     total = dofs.reduced(owners, gap.total.ravel())[chosen]
     low = dofs.reduced(owners, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduced(owners, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
-    moved = dofs.nodes is not None
-    least = np.where(moved & (curved | (high == np.inf)), -np.inf, low)
-    mean = np.clip(total / area, least, np.inf if moved else high)
+    mean = total / area if dofs.nodes is not None else np.clip(total / area, low, high)
     return np.where(np.abs(mean) <= rounding, 0.0, mean), high - low
 
 

@@ -166,16 +166,26 @@ class MortarIntegrals:
 
 
 def integrate(
-    kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments, enough: float
+    kind: FacetKind,
+    secondary: Facets,
+    primary: Facets,
+    segments: Segments,
+    moved: bool,
+    curved: bool,
 ) -> MortarIntegrals:
     """Return integrals over segments of the secondary facets' multipliers.
 
-    They are dual ones on facets that are covered by a share that is enough.
+    They are dual ones; but where nodes have ``moved``, which rows have to follow, hats take a part
+    on facets that are covered by little, or where a mean is below all gaps that it is of: of
+    ``curved`` gaps, whose curvature rows do not follow, it may be.
     """
     at = segments.points
     corners, near = segments.corners, near_held(kind, secondary, primary, segments)
     weight = segments.weight * radii(kind, secondary, at.secondary, at.xi)
+    enough = SEARCH.extrapolated if moved else SEARCH.hardly_covered
     dual = facet_multipliers(kind, secondary, at.secondary, at.xi, weight, near, enough)
+    if moved and not curved:
+        dual = _above_lowest(kind, secondary, primary, segments, dual, weight)
     if np.any(secondary.held) and np.any(primary.held):
         corner, *held = held_by_both(kind, secondary, primary, corners, dual.facet)
         dual, used = dual.with_points(kind, *held)
@@ -201,6 +211,32 @@ def integrate(
         ),
         shares=dual.neighbours(secondary),
     )
+
+
+def _above_lowest(
+    kind: FacetKind,
+    secondary: Facets,
+    primary: Facets,
+    segments: Segments,
+    dual: FacetMultipliers,
+    weight: Array,
+) -> FacetMultipliers:
+    """Let multipliers of facets pass into hats until no mean of gaps is below all of a facet.
+
+    ψ_i is negative somewhere, hats are not. Then rows are those of the means, as they are not where
+    means have a bound: (1 − p)ψ_i + pφ_i has the integral of ψ_i, and the sum 1.
+    """
+    apart = _apart(kind, secondary, primary, segments.points, curved=False)
+    gap = np.einsum("md,mvd->mv", apart, secondary.vertex_normals[dual.facet][dual.place])
+    hats = weight[:, None] * kind.hats.values(segments.points.xi)
+    both = (sum_rows(dual.place, w * gap, len(dual.facet)) for w in (dual.weighted, hats))
+    mean, of_hats = (quotient(total, dual.covered) for total in both)
+    low = _gaps(kind, secondary, primary, segments, dual).lowest
+    low -= SEARCH.below * secondary.radius[dual.facet, None]
+    short = np.where(segments.whole[dual.facet, None], np.maximum(low - mean, 0.0), 0.0)
+    part = quotient(short, of_hats - mean).max(axis=1, initial=0.0)
+    part = np.minimum(part, 1.0)[dual.place, None]
+    return replace(dual, weighted=(1.0 - part) * dual.weighted + part * hats)
 
 
 def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> MortarIntegrals:

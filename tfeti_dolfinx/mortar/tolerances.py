@@ -29,8 +29,10 @@ class SearchTolerances:
     # slivers
     hardly_covered: float = 1e-6
     # in finite strain covered share below which dual multipliers pass into hats: over strips they
-    # extrapolate gaps, which have no bounds there; hats alone are nearly dependent
+    # extrapolate gaps; hats alone are nearly dependent
     extrapolated: float = 0.3
+    # of a facet: how far a mean may be below all gaps there, which is rounding on flat ones
+    below: float = 1e-8
     # covered share from which on a node's pressure is believed: those of nodes with less were 5 to
     # 40 000 times those beside them, of blocks on flat faces
     believed: float = 0.02
