@@ -189,10 +189,7 @@ def test_mistakes_of_motions():
         "mass: .*volume": {"mass": {"nobody": 1.0}},
         "stabilised=1: expected True or False": {"stabilised": 1},
         "rtol auto: errors of steps": {"petsc_options": {"rtol": "auto"}, "stress": hooke()},
-        "lumped=True with a form of the mass; expected a": {
-            "mass": u[0] * v[0] * dx,
-            "lumped": True,
-        },
+        "lumped=True with a form of the mass; expected a": dict(mass=u[0] * v[0] * dx, lumped=True),
         "velocity is ": {"velocity": fem.Function(quadratic)},
     }.items():
         with pytest.raises(tfeti.InputError, match=says):

@@ -217,9 +217,8 @@ def test_two_steels_yield_each_by_its_own_law(kind, form, comm):
     parts += [("hard", (0.0, 2.0, 0.0), (1.0, 3.0, 1.0), (2, 2, 2))]
     bars = {"soft": lambda x: x[1] < 1.5, "hard": lambda x: x[1] > 1.5}
     cut = torn_boxes("tetrahedron", parts, 3, volumes=bars)
-    laws = {"soft": (0.01, 0.05), "hard": (0.02, 0.2)}
-    if form == "constant":
-        laws["hard"] = laws["soft"]
+    soft, hard = (0.01, 0.05), (0.02, 0.2)
+    laws = {"soft": soft, "hard": soft if form == "constant" else hard}
     given = {}
     for k, name in enumerate(("yield_stress", "hardening")):
         soft, hard = laws["soft"][k], laws["hard"][k]

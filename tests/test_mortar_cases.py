@@ -102,10 +102,7 @@ def test_the_reach_does_not_change_the_answer(comm, order, sides):
 
 
 def test_facets_of_second_order_touch_without_overlap(comm):
-    """The chord and the arc touch the block at the same vertex: no initial overlap.
-
-    The arc lies outside of the chord: a little more force.
-    """
+    """The arc lies outside of the chord that touches the block at its vertex: more force."""
     forces = []
     for order in (1, 2):
         d, bcs = disc_on_block(comm, order)

@@ -152,8 +152,7 @@ def test_other_data_make_what_depends_on_them_alone(scene):
     assert apart(second.u, scene.fresh(held=-0.01).u) <= 1e-8
     third = scene.solve(E=2.0)
     report = scene.problem.report
-    assert report.searches == 0
-    assert report.assemblies == report.gluings == report.coarse_factorizations == 1
+    assert [*counters(report)[:3], report.coarse_factorizations] == [1, 0, 1, 1]
     assert report.factorizations > 0
     assert apart(third.u, scene.fresh(E=2.0).u) <= 1e-8
     assert (report.in_all["solves"], report.in_all["searches"]) == (3, 1)
@@ -169,10 +168,9 @@ def test_another_gap_makes_no_row(pair):
     before, name = first.remaining_gap.copy(), scene.problem.contacts[0].name
     size, field = fem.Constant(mesh, 0.0), fem.Function(fem.functionspace(mesh, ("Lagrange", 1)))
     for gap in (size, field, lambda x: size.value + 0.0 * x[0]):
+        scene.problem.update(gap={name: gap})
         for value in (0.01, 0.0, 0.01, 0.01):
             size.value = field.x.array[:] = value
-            if scene.problem.contacts[0].gap is not gap:
-                scene.problem.update(gap={name: gap})
             other.problem.update(gap={0: value})
             assert apart(scene.solve().u, other.solve().u) <= 1e-8
             assert counters(scene.problem.report) == [0] * len(COUNTERS)

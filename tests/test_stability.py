@@ -97,10 +97,7 @@ def test_degree_1_is_warned_of_where_a_material_keeps_its_volume(nu, degree, cap
 
 
 def test_warnings_can_be_switched_off():
-    """Of a part that turns, and motions that a floor leaves free; the answer stays.
-
-    Of a small load nothing is warned.
-    """
+    """Of a part that turns, of motions that a floor leaves free, and none of a small load."""
     small = solved(problem(decomposed("quadrilateral", 4, 4), traction=(0.0, -0.02)))
     assert small.report.warnings == []
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))

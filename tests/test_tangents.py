@@ -31,10 +31,7 @@ def weights_of(dofs):
     [("triangle", 1), ("quadrilateral", 2), ("tetrahedron", 2), ("hexahedron", 1)],
 )
 def test_rows_measure_slips(cell, degree):
-    """On displacements without jumps T u = s_i times the slip; contacts without friction have none.
-
-    Meshes differ, and the lower body is on an obstacle that it slides on freely.
-    """
+    """T u = s_i times the slip of u without jumps; the lower body slides on an obstacle."""
     d = stacked(cell, 3, 4, 6)
     dofs, up = dofs_on(d, degree), np.eye(d.mesh.geometry.dim)[-1]
     smooth = tfeti.Obstacle("lower bottom", tfeti.Plane(-1.01 * up, up), reach=np.inf)

@@ -86,6 +86,7 @@ SCENES_2D = st.tuples(
     st.integers(1, 4),
     st.tuples(stresses(-0.06, 0.06), stresses(-0.08, 0.01)),
     ONE.map(lambda bound: (bound,)),
+    st.just(0.0),
 )
 SCENES_3D = st.tuples(
     st.sampled_from(["tetrahedron", "hexahedron"]),
@@ -104,22 +105,17 @@ def by_law(law, scene):
     return (*scene[:4], bounds, *scene[5:]), {"kind": kind, "share": share}
 
 
+SCENES = pytest.mark.parametrize("scenes", [SCENES_2D, SCENES_3D], ids=["square", "cube"])
+
+
 @LAWS
 @SOLVERS
-@settings(max_examples=7)
-@given(SCENES_2D, st.sampled_from([0.0, 0.01]))
-def test_a_square_on_a_plane(qp_type, law, scene, gap):
-    scene, given = by_law(law, scene)
+@SCENES
+@settings(max_examples=5)
+@given(st.data(), st.sampled_from([0.0, 0.01]))
+def test_a_box_on_a_plane(qp_type, law, scenes, data, gap):
+    scene, given = by_law(law, data.draw(scenes))
     on_the_plane(*scene, gap=gap, qp_type=qp_type, **given)
-
-
-@LAWS
-@SOLVERS
-@settings(max_examples=4)
-@given(SCENES_3D)
-def test_a_cube_on_a_plane(qp_type, law, scene):
-    scene, given = by_law(law, scene)
-    on_the_plane(*scene, qp_type=qp_type, **given)
 
 
 def test_some_nodes_stick_and_some_slip():
@@ -162,17 +158,9 @@ SIDES = st.sampled_from(["lower top", "upper bottom"])
 
 @LAWS
 @SOLVERS
-@settings(max_examples=5)
-@given(SCENES_2D, SIDES)
-def test_a_square_on_a_square(qp_type, law, scene, secondary):
-    scene, given = by_law(law, scene)
-    two_boxes(*scene, 0.0, secondary, qp_type=qp_type, **given)
-
-
-@LAWS
-@SOLVERS
-@settings(max_examples=3)
-@given(SCENES_3D, SIDES)
-def test_a_cube_on_a_cube(qp_type, law, scene, secondary):
-    scene, given = by_law(law, scene)
+@SCENES
+@settings(max_examples=4)
+@given(st.data(), SIDES)
+def test_a_box_on_a_box(qp_type, law, scenes, data, secondary):
+    scene, given = by_law(law, data.draw(scenes))
     two_boxes(*scene, secondary, qp_type=qp_type, **given)

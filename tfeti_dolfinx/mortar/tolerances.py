@@ -31,8 +31,8 @@ class SearchTolerances:
     # in finite strain covered share below which dual multipliers pass into hats: over strips they
     # extrapolate gaps; hats alone are nearly dependent
     extrapolated: float = 0.3
-    # of a facet: how far a mean of gaps may be below all of them. Where nearly flat faces press each
-    # other, far less would let rows change by much for gaps that change by little
+    # of a facet: how far a mean of gaps may be below all of them. Where nearly flat faces press
+    # each other, far less would let rows change by much for gaps that change by little
     below: float = 1e-3
     # covered share from which on a node's pressure is believed: those of nodes with less were 5 to
     # 40 000 times those beside them, of blocks on flat faces
