@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import combinations_with_replacement
 
@@ -184,17 +185,20 @@ def integrate(
     weight = segments.weight * radii(kind, secondary, at.secondary, at.xi)
     enough = SEARCH.extrapolated if moved else SEARCH.hardly_covered
     dual = facet_multipliers(kind, secondary, at.secondary, at.xi, weight, near, enough)
+    apart = [_apart(kind, secondary, primary, of, curved=False) for of in (at, corners)]
     if moved and not curved:
-        dual = _above_lowest(kind, secondary, primary, segments, dual, weight)
+        dual = _above_lowest(kind, secondary, segments, dual, weight, apart)
     if np.any(secondary.held) and np.any(primary.held):
         corner, *held = held_by_both(kind, secondary, primary, corners, dual.facet)
         dual, used = dual.with_points(kind, *held)
         both = ((getattr(at, f.name), getattr(corners, f.name)[corner[used]]) for f in fields(at))
         at = FacingPoints(*map(np.concatenate, both))
         segments = replace(segments, points=at)
-    gap = curved_gap = _gaps(kind, secondary, primary, segments, dual)
+        apart[0] = np.concatenate((apart[0], apart[1][corner[used]]))
+    gap = curved_gap = _gaps(secondary, segments, dual, apart)
     if np.any(secondary.curvature) or np.any(primary.curvature):
-        curved_gap = _gaps(kind, secondary, primary, segments, dual, curved=True)
+        apart = [_apart(kind, secondary, primary, of, curved=True) for of in (at, corners)]
+        curved_gap = _gaps(secondary, segments, dual, apart)
     own = dual.integrals(kind.displacement.values(at.xi))
     pair, place = np.unique(at.secondary * len(primary) + at.primary, return_inverse=True)
     theirs = kind.displacement.values(at.eta)
@@ -216,22 +220,22 @@ def integrate(
 def _above_lowest(
     kind: FacetKind,
     secondary: Facets,
-    primary: Facets,
     segments: Segments,
     dual: FacetMultipliers,
     weight: Array,
+    apart: Sequence[Array],
 ) -> FacetMultipliers:
     """Let multipliers of facets pass into hats until no mean of gaps is below all of a facet.
 
     ψ_i is negative somewhere, hats are not. Then rows are those of the means, as they are not where
     means have a bound: (1 − p)ψ_i + pφ_i has the integral of ψ_i, and the sum 1.
     """
-    apart = _apart(kind, secondary, primary, segments.points, curved=False)
-    gap = np.einsum("md,mvd->mv", apart, secondary.vertex_normals[dual.facet][dual.place])
+    normals = secondary.vertex_normals[segments.points.secondary]
+    gap = np.einsum("md,mvd->mv", apart[0], normals)
     hats = weight[:, None] * kind.hats.values(segments.points.xi)
     both = (sum_rows(dual.place, w * gap, len(dual.facet)) for w in (dual.weighted, hats))
     mean, of_hats = (quotient(total, dual.covered) for total in both)
-    low = _gaps(kind, secondary, primary, segments, dual).lowest
+    low = _gaps(secondary, segments, dual, apart).lowest
     low -= SEARCH.below * secondary.radius[dual.facet, None]
     short = np.where(dual.covered > 0.0, np.maximum(low - mean, 0.0), 0.0)
     part = np.minimum(quotient(short, of_hats - mean).max(axis=1, initial=0.0), 1.0)
@@ -259,19 +263,13 @@ def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> Mort
 
 
 def _gaps(
-    kind: FacetKind,
-    secondary: Facets,
-    primary: Facets,
-    segments: Segments,
-    dual: FacetMultipliers,
-    curved: bool = False,
+    secondary: Facets, segments: Segments, dual: FacetMultipliers, apart: Sequence[Array]
 ) -> GapIntegrals:
-    """Return gaps over segments, between the facets or the smooth surfaces that they stand for."""
+    """Return gaps over segments from what closes them at points and corners, see ``_apart``."""
     normals, both = secondary.vertex_normals[dual.facet], (segments.points, segments.corners)
-    at, corners = (_apart(kind, secondary, primary, of, curved) for of in both)
     # n_i·(x_p − x_s) at points and corners
     place = np.searchsorted(dual.facet, np.concatenate([of.secondary for of in both]))
-    gap = np.einsum("md,mvd->mv", np.concatenate((at, corners)), normals[place])
+    gap = np.einsum("md,mvd->mv", np.concatenate(apart), normals[place])
     lowest, highest = np.full(dual.covered.shape, np.inf), np.full(dual.covered.shape, -np.inf)
     np.minimum.at(lowest, place, gap)
     np.maximum.at(highest, place, gap)
@@ -279,7 +277,7 @@ def _gaps(
     highest[~segments.whole[dual.facet]] = np.inf
     counts = dual.covered.sum(axis=1) > 0.0  # what is hardly covered has no multipliers
     lowest[~counts], highest[~counts] = np.inf, -np.inf
-    return GapIntegrals(np.sum(dual.integrals(at) * normals, axis=2), lowest, highest)
+    return GapIntegrals(np.sum(dual.integrals(apart[0]) * normals, axis=2), lowest, highest)
 
 
 def _apart(
