@@ -227,8 +227,9 @@ def _above_lowest(
 ) -> FacetMultipliers:
     """Let multipliers of facets pass into hats until no mean of gaps is below all of a facet.
 
-    ψ_i is negative somewhere, hats are not. Then rows are those of the means, as they are not where
-    means have a bound: (1 − p)ψ_i + pφ_i has the integral of ψ_i, and the sum 1.
+    By ``SEARCH.below`` of the facet it may be. ψ_i is negative somewhere, hats are not. Then rows
+    are those of the means, as they are not where means have a bound: (1 − p)ψ_i + pφ_i has the
+    integral of ψ_i, and the sum 1.
     """
     normals = secondary.vertex_normals[segments.points.secondary]
     gap = np.einsum("md,mvd->mv", apart[0], normals)
