@@ -72,7 +72,7 @@ class EndPlanes:
     ``near``, over the mesh's extent, lies in a plane.
     """
 
-    def __init__(self, dofs: TornDofs, near: float = 1e-9) -> None:
+    def __init__(self, dofs: TornDofs, near: float = 1e-6) -> None:
         self._comm, gdim = dofs.comm, dofs.V.mesh.geometry.dim
         x = dofs.points(at_rest=True)[:, :gdim]
         low, high = box_over_ranks(dofs.comm, x)

@@ -105,9 +105,8 @@ class Elasticity:
             nu, on, "nu", POISSON_OF_SHEETS if self.model == "plane_stress" else POISSON
         )
         self.mu = self.E / 2 / (1 + self.nu)
-        self._made_of: tuple[Any, ...] = (None,) * 4  # that of the last displacement is kept
-        self._stress: Any = None
-        self.thickness: Any = 1.0
+        self._stress: tuple[Any, Any] = (None, None)  # that of the last displacement is kept
+        times: Any = 1.0
         if self.model == "axisymmetric":
             r, comm = self.mesh.geometry.x[:, 0], self.mesh.comm
             self._on_axis = self._near_axis * largest(comm, r)
@@ -117,11 +116,21 @@ class Elasticity:
                     f"model='axisymmetric': the mesh has points with the radius x[0] = {lowest:.6g}"
                     "; expected 0 or more"
                 )
-            self.thickness = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]
+            times = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]
         elif thickness is not None:
-            self.thickness = in_ufl(thickness, on, "thickness", POSITIVE)
-            if not isinstance(self.thickness, fem.Constant):
-                check_not_negative(self.thickness, "thickness", self.mesh)
+            times = in_ufl(thickness, on, "thickness", POSITIVE)
+            if not isinstance(times, fem.Constant):
+                check_not_negative(times, "thickness", self.mesh)
+        self.thickness = times
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse another modulus: forms hold the one that is there."""
+        if name in ("E", "nu", "mu", "thickness") and name in vars(self):
+            raise InputError(
+                f"{name} = {shown(value)} of an Elasticity: forms hold what it is; expected a new "
+                f"value of that, as in elasticity.{name}.value = ... for a constant"
+            )
+        super().__setattr__(name, value)
 
     def strain(self, u: Any) -> Any:
         """Linear strain of a displacement, a UFL tensor of shape ``(3, 3)``.
@@ -156,8 +165,7 @@ class Elasticity:
         Raises:
             InputError: As ``strain``.
         """
-        made_of = (u, self.E, self.nu, self.mu)
-        if not all(a is b for a, b in zip(made_of, self._made_of, strict=True)):
+        if u is not self._stress[0]:
             e, E, nu, mu = self.strain(u), self.E, self.nu, self.mu
             lmbda = E * nu / (1 + nu) / (1 - 2 * nu)
             sigma = 2 * mu * e + lmbda * ufl.tr(e) * ufl.Identity(3)
@@ -172,8 +180,8 @@ class Elasticity:
                         [0, 0, 0],
                     ]
                 )
-            self._made_of, self._stress = made_of, sigma
-        return self._stress
+            self._stress = u, sigma
+        return self._stress[1]
 
     def a(self, u: Any, v: Any, dx: ufl.Measure | None = None) -> ufl.Form:
         """The bilinear form ∫σ(u):ε(v) over the volume: times ``thickness``, 2πr if axisymmetric.
