@@ -272,21 +272,54 @@ def test_load_steps_take_laws_of_time_and_write_a_table(tmp_path):
 
 
 def test_a_tool_that_hits_is_a_body_that_falls():
-    """Galilei: a plane that comes with a velocity, and a square that has the opposite one."""
+    """Galilei: a plane, by a law or far heavier, and a square that has the opposite velocity."""
     scene, speed, found = {**block(2, n=4), "bcs": []}, 0.2, []
     V = scene["a"].arguments()[0].ufl_function_space()
-    for moves in ("tool", "body"):
+    for moves in ("tool", "body", "hammer"):
         begin = fem.Function(V)
         begin.x.array.reshape(-1, 2)[:, 1] = speed if moves == "body" else 0.0
         law = (lambda t: (0.0, -speed * t)) if moves == "tool" else (0.0, 0.0)
-        tool = tfeti.RigidBody(top(2, 1.05), displacement=law)
+        heavy = {"mass": 1e12, "velocity": (0, -speed), "free": ("y",)} if moves == "hammer" else {}
+        tool = tfeti.RigidBody(top(2, 1.05), displacement=law, **heavy)
         given = {"mass": 1.0, "velocity": begin, "petsc_options": TIGHT}
         problem = tfeti.ContactDynamics(**scene, contacts=[tfeti.Obstacle("top", tool)], **given)
         records = tfeti.LoadSteps(problem, lambda problem, t: None, np.linspace(0.1, 1.0, 10)).run()
         assert max(abs(r.tools["tool of surface 'top' force y"]) for r in records) > 0.0
-        shift = speed * 1.0 if moves == "tool" else 0.0
+        shift = 0.0 if moves == "body" else speed * 1.0
         found.append(problem.u.x.array.reshape(-1, 2) + (0.0, shift))
-    assert np.abs(found[0] - found[1]).max(initial=0.0) <= 1e-9
+    assert all(np.abs(x - found[1]).max(initial=0.0) <= 1e-9 for x in found)
+
+
+@pytest.mark.parametrize("kind", ["linear", "stabilised", "finite"])
+def test_a_hammer_and_a_block_have_one_momentum(kind, shared_tmp):
+    """They fly after a slanted blow with friction; a run goes on from its checkpoint."""
+    found, path, times = [], shared_tmp / "hammer", 0.01 * np.arange(1, 21)
+    for last in (20, 9, 20):
+        scene = {**block(2, n=4), "bcs": []}
+        V, v = scene["a"].arguments()[0].ufl_function_space(), scene["a"].arguments()[0]
+        shape = {"point": (0.7, 1.2), "free": ("x", "y", "rz"), "velocity": (0.3, -2.0)}
+        plate = tfeti.Plane((0.5, 1.01), normal=(0.02, -1.0))
+        hammer = tfeti.RigidBody(plate, **shape, mass=0.5, inertia=0.02, force=(0.0, -0.2))
+        given = {"contacts": [tfeti.Obstacle("top", hammer, friction=ROUGH, reach=1.0)]}
+        given |= {"mass": 1.0, "stabilised": kind != "linear", "petsc_options": {"rtol": 1e-9}}
+        if kind == "finite":
+            u, _, _ = fem.Function(V), scene.pop("a"), scene.pop("L")
+            F = ufl.derivative(neo_hooke(u, 1.0, 0.3) * DX, u, v)
+            problem = tfeti.NonlinearContactDynamics(F, u, finite=True, **scene, **given)
+        else:
+            problem = tfeti.ContactDynamics(**scene, **given)
+        steps = tfeti.LoadSteps(problem, lambda problem, t: None, times[:last], checkpoint=path)
+        records = steps.run(resume=last == 20 and len(found) > 0)
+        found.append(problem.u.x.array)
+        tool, motion = problem.solution.tool(0), [record.motion for record in records]
+        assert max(abs(one["defect"]) for one in motion) < 1e-9
+        assert sum(one["friction"] for one in motion) <= 0.0 < np.abs(tool.spin[2])
+        both = 0.5 * tool.velocity
+        for k in (0, 1):
+            moves = fem.assemble_scalar(fem.form(problem.solution.velocity[k] * ufl.dx))
+            both[k] += V.mesh.comm.allreduce(moves)
+        assert np.allclose(both, (0.15, -1.0 - 0.2 * times[last - 1]), rtol=0.0, atol=1e-11)
+    assert apart(found[2], found[0]) < 1e-8
 
 
 def test_poses_are_rigid():
@@ -321,6 +354,11 @@ def test_poses_are_rigid():
         ({"displacement": (0, np.nan)}, "2 finite"),
         ({"point": (0, 0, 0)}, "2 components"),
         ({"free": ("y",), "large": True}, "large=True"),
+        ({"free": ("y",), "mass": 1.0}, "a mass in a problem without"),
+        ({"free": ("y", "rz"), "mass": 1.0}, "rz is free and has no moment of inertia"),
+        ({"free": ("y",), "mass": 1.0, "velocity": (1, 0)}, "a part along x, which is not free"),
+        ({"free": ("y",), "velocity": (0, 1)}, "and no mass; expected mass="),
+        ({"mass": 1.0}, "a mass, and no free motion"),
     ],
 )
 def test_what_does_not_fit_is_named(given, words):
@@ -434,7 +472,7 @@ def test_a_body_that_was_pushed_stays_when_tools_go_back(reach, weight, finite):
 
 
 def test_a_tool_without_mass_is_named_in_dynamics():
-    scene, named = {**block(2, n=2), "mass": 1.0}, "free motions in a ContactDynamics"
+    scene, named = {**block(2, n=2), "mass": 1.0}, "in a problem of bodies with mass; expected its"
     contacts = [tfeti.Obstacle("top", tfeti.RigidBody(top(2), force=(0, -1), free=("y",)))]
     with pytest.raises(tfeti.InputError, match=named):
         tfeti.ContactDynamics(**scene, contacts=contacts)

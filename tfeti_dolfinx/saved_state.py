@@ -165,6 +165,9 @@ class SavedState:
     internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # motions of rigid bodies, one after the other
     tools: Array = field(default_factory=lambda: np.zeros(0))
+    # of their unknowns, with mass: velocities, and loads at the begin of the next step
+    tool_speed: Array = field(default_factory=lambda: np.zeros(0))
+    tool_loads: Array = field(default_factory=lambda: np.zeros(0))
     image: Array = field(default_factory=lambda: np.zeros(0))  # Fλ; empty where it is not known
     predicted_image: Array = field(default_factory=lambda: np.zeros(0))  # the same of the predictor
     # D of a nonlinear problem, which rows are scaled with, in primal order; else empty

@@ -96,9 +96,9 @@ class Settings:
                 "Subdomains, as clusters are; expected a motion by a law, or none of them"
             )
         if tools and tools.num_local:  # the last rank has their Blocks
-            loads, modes = tools.loads, tools.mode
+            load, K, k = tools.load, tools.stiffness, tools.law.shape[1]
             rigid = [
-                RigidBlock(tools.bodies[i].name, loads[at], modes[at], tools.law.shape[1])
+                RigidBlock(tools.bodies[i].name, load[at], tools.mode[at], k, K[np.ix_(at, at)])
                 for i, at in tools.unknowns.items()
             ]
         if dofs.comm.rank == 0:

@@ -408,6 +408,8 @@ class Solution:
             displacement=tool.motion[:gdim],
             rotation=rotation_vector(tool.motion, gdim),
             resultant=resultant(self.dofs.comm, arm, -self.condition_forces[own]),
+            velocity=None if tool.velocity is None else tool.velocity[:gdim],
+            spin=None if tool.velocity is None else rotation_vector(tool.velocity, gdim),
         )
 
     def reaction(self, surface: str | int) -> Resultant:

@@ -96,6 +96,7 @@ class System(Generic[OwnForms]):
         )
         self.origin: Array | None = None
         self.tools, self.time = Tools(contacts, dofs), 0.0
+        self.tools.check_mass(forms.has_mass)
         # displacement in primal order at which the load step begins; None: no displacement
         self._rest: Array | None = None
         self._known_slips: tuple[ContactRecords, Array] | None = None
@@ -372,8 +373,8 @@ class System(Generic[OwnForms]):
     def _assemble_load(self) -> None:
         self._f = self.elements.load(self.forms)
         if self._subdomains is not None:
-            loads = self.tools.loads[: self.tools.num_local]
-            self._subdomains.update(f=np.append(self._dofs.to_primal(self._f), loads))
+            load = self.tools.load[: self.tools.num_local]
+            self._subdomains.update(f=np.append(self._dofs.to_primal(self._f), load))
             self._take_rounding(self._subdomains)
 
     def _take_rounding(self, subdomains: Subdomains) -> None:

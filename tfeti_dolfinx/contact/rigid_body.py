@@ -11,7 +11,15 @@ from dolfinx import fem
 from scipy.spatial.transform import Rotation
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
-from tfeti_dolfinx.common.validation import checked_flag, checked_type, checked_vector, named, shown
+from tfeti_dolfinx.common.validation import (
+    POSITIVE,
+    checked_flag,
+    checked_number,
+    checked_type,
+    checked_vector,
+    named,
+    shown,
+)
 from tfeti_dolfinx.contact.shapes import Placed, Point, Shape, check_shape
 from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh
 from tfeti_dolfinx.errors import InputError
@@ -110,6 +118,11 @@ class RigidBody:
         force: On the body, gdim components; with a thickness, on all of it.
         moment: About ``point``: a number in 2D, three components in 3D.
         free: Names of the motions that are free.
+        mass: Of the body, in a ``ContactDynamics``, where free motions need it.
+        inertia: Moments of inertia about the axes through ``point``, which is the centre of mass
+            then: a number in 2D, three in 3D (of the axes x, y, z); where turns are free.
+        velocity: That of ``point`` at the start of a ``ContactDynamics``, gdim components, along
+            free motions; default 0.
         point: Default the centre or the point of the shape, else the origin.
         name: For messages and ``solution.tool(name)``. Default: "tool of surface 'a'".
         large: Whether its motion is not small compared with the shape: then its shape is placed
@@ -132,6 +145,9 @@ class RigidBody:
     force: Law | None = None
     moment: Law | None = None
     free: Sequence[str] = ()
+    mass: float | None = None
+    inertia: float | Sequence[float] | None = None
+    velocity: Sequence[float] | None = None
     point: Point | None = None
     name: str = ""
     large: bool = False
@@ -153,6 +169,12 @@ class RigidBody:
             raise InputError(
                 f"{what}: a force or a moment, and no free motion; expected free=, as free=('z',)"
             )
+        if self.mass is not None:
+            checked_number(self.mass, f"{what}: mass", POSITIVE)
+        elif self.inertia is not None or self.velocity is not None:
+            raise InputError(f"{what}: inertia or a velocity, and no mass; expected mass=")
+        if self.mass is not None and not self.free:
+            raise InputError(f"{what}: a mass, and no free motion; expected free=, as free=('z',)")
         if self.large and self.free:
             raise InputError(
                 f"{what}: large=True with free motions; expected a body that moves by a law alone"
@@ -167,6 +189,42 @@ class RigidBody:
             raise InputError(f"{whose}: free={wrong}; expected some of {MOTIONS[gdim]} in {gdim}D")
         if self.point is not None and len(self.point) != gdim:
             raise InputError(f"{whose}: point={self.point}, expected {gdim} components")
+
+    def masses(self, gdim: int) -> Array:
+        """Return mass, and inertia, of each motion, shape ``(k,)``; 0 where there is none.
+
+        Raise an InputError where inertia does not fit.
+        """
+        turns = (1,) if gdim == 2 else (3,)
+        inertia = np.zeros(turns)
+        if self.inertia is not None:
+            expected = f"{turns[0]} positive number(s)"
+            inertia = checked_vector(self.inertia, f"{self.name}: inertia", turns, expected)
+        masses = np.append(np.full(gdim, self.mass or 0.0), inertia[::-1])
+        if self.mass is not None and np.any(wrong := masses[own := self.indices(gdim)] <= 0.0):
+            motion = MOTIONS[gdim][own[int(np.argmax(wrong))]]
+            raise InputError(
+                f"{self.name}: {motion} is free and has no moment of inertia; expected inertia=, "
+                f"{turns[0]} positive number(s)"
+            )
+        return masses
+
+    def start(self, gdim: int) -> Array:
+        """Return the velocity at the start, shape ``(k,)``.
+
+        Raise an InputError where it does not fit.
+        """
+        speed = np.zeros(len(MOTIONS[gdim]))
+        if self.velocity is not None:
+            expected, what = f"{gdim} finite numbers", f"{self.name}: velocity"
+            speed[:gdim] = checked_vector(self.velocity, what, [gdim], expected)
+        for motion, value in zip(MOTIONS[gdim], speed, strict=True):
+            if value and motion not in self.free:
+                raise InputError(
+                    f"{self.name}: the velocity has a part along {motion}, which is not free "
+                    f"(free={self.free})"
+                )
+        return speed
 
     def distance(self, x: Array) -> Array:
         """Signed distance from where it is, shape ``(n,)``."""

@@ -72,17 +72,23 @@ class ToolState:
             0.
         resultant: Force and moment of all its contacts on it, friction included; the moment about
             its point.
+        velocity: Of its point along free motions, shape ``(gdim,)``; None without a mass.
+        spin: Angular velocity likewise, in radians per time, shape ``(3,)``.
     """
 
     name: str
     displacement: Array
     rotation: Array
     resultant: Resultant
+    velocity: Array | None
+    spin: Array | None
 
     def __str__(self) -> str:
         """One line: names of what is not 0, and its numbers."""
         parts = {"displacement": self.displacement, "rotation": self.rotation}
         parts |= {"force": self.resultant.force, "moment": self.resultant.moment}
+        if self.velocity is not None and self.spin is not None:
+            parts |= {"velocity": self.velocity, "spin": self.spin}
         words = [
             f"{what} ({', '.join(f'{value:.6g}' for value in values)})"
             for what, values in parts.items()
@@ -101,6 +107,8 @@ class ToolState:
             "force": (axes, self.resultant.force),
             "moment": (turns, self.resultant.moment[-len(turns) :]),
         }
+        if self.velocity is not None and self.spin is not None:
+            parts |= {"velocity": (axes, self.velocity), "spin": (turns, self.spin[-len(turns) :])}
         return {
             f"{self.name} {what} {axis}": float(value)
             for what, (names, values) in parts.items()

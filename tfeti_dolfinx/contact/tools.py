@@ -1,5 +1,8 @@
 """The rigid bodies of a problem: where they are, and how rows of contact know them."""
 
+from __future__ import annotations
+
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -36,6 +39,7 @@ class ToolMotion:
     motion: Array  # displacement and rotation vector of its point in the order of `MOTIONS`
     centre: Array  # where the point was when contact was searched, shape (gdim,)
     contacts: Array  # the contacts that it is in
+    velocity: Array | None  # of free motions, in the same order; None without a mass
 
 
 class Tools:
@@ -61,6 +65,12 @@ class Tools:
         found: Motions of each body on top of that and of its law, of the last solve, shape
             ``(bodies, k)``; 0 but for free ones.
         begin: Where each body was when the load step began.
+        mass: That of the unknowns, shape ``(num_unknowns, num_unknowns)``.
+        size: The time step τ of bodies with mass: as nodes they have the stiffness 2M/τ², since
+            their own is 0; 0 where there is no inertia.
+        speed: Velocity of the unknowns when the step began, shape ``(num_unknowns,)``; ``start``
+            what a predictor has left of it, and ``drift`` how far it takes them in the step.
+        loads_at_begin: Force and moment when the step began.
     """
 
     def __init__(self, contacts: Sequence[ContactPartner], dofs: TornDofs) -> None:
@@ -106,6 +116,13 @@ class Tools:
             by_turns = motion_fields(middle[None])[0, self.mode[turns]] / self._sizes[i]
             self.basis[moves, moves], self.basis[turns, turns] = 1.0, 1.0 / self._sizes[i]
             self.basis[np.ix_(moves, turns)] = -by_turns[:, self.mode[moves]].T
+        masses, speeds = np.zeros((2, count, k))
+        for i, body in enumerate(self.bodies):
+            masses[i], speeds[i] = body.masses(gdim), body.start(gdim)
+        self.mass = self.basis.T @ (masses[self.tool, self.mode][:, None] * self.basis)
+        self.speed: Array = self._unknowns(speeds)
+        self.start, self.drift = self.speed, 0.0 * self.speed
+        self.loads_at_begin, self.size = 0.0 * self.speed, 0.0
         self.law: Array = np.zeros((count, k))
         self.found: Array = np.zeros((count, k))
         self.loads: Array = np.zeros(self.num_unknowns)
@@ -138,6 +155,55 @@ class Tools:
             changed.add("places" if np.any(placed) else "right side")
         return changed
 
+    def check_mass(self, has_mass: bool) -> None:
+        """Raise an InputError where a body has a mass that none may have, or none that it needs."""
+        for i in self.unknowns:
+            if (self.bodies[i].mass is None) == has_mass:
+                name, free = self.bodies[i].name, self.bodies[i].free
+                raise InputError(
+                    f"{name}: free={free} in a problem of bodies with mass; expected its mass="
+                    if has_mass
+                    else f"{name}: a mass in a problem without; expected none, or a ContactDynamics"
+                )
+
+    @property
+    def stiffness(self) -> Array:
+        """2M/τ² of the unknowns, 0 without inertia."""
+        return self.mass * (2.0 / self.size**2 if self.size else 0.0)
+
+    @property
+    def load(self) -> Array:
+        """What the unknowns bear: the mean load and 2Mw/τ², w where they would be without it."""
+        if not self.size:
+            return self.loads
+        mean = 0.5 * (self.loads_at_begin + self.loads)
+        return np.asarray(mean + self.stiffness @ (self.at_begin() + self.drift))
+
+    def set_out(self, size: float) -> None:
+        """Begin a time step with the present velocity."""
+        self.size, self.start, self.drift = size, self.speed, size * self.speed
+
+    def of_mass_alone(self) -> Tools:
+        """Return the same bodies with M for a stiffness, and Mw for a load."""
+        other = copy.copy(self)
+        other.loads = other.loads_at_begin = np.zeros(self.num_unknowns)
+        other.size, other.found = np.sqrt(2.0), self.found.copy()
+        return other
+
+    def way(self) -> Array:
+        """Return how far the unknowns have come in the load step, shape ``(num_unknowns,)``."""
+        return self._unknowns(self.found) - self.at_begin()
+
+    def speed_at_end(self) -> Array:
+        """Return the velocity of the unknowns at the end of the time step."""
+        if not self.size:
+            return np.zeros(self.num_unknowns)
+        return np.asarray(self.start + 2.0 / self.size * (self.way() - self.drift))
+
+    def _unknowns(self, motions: Array) -> Array:
+        """Return the unknowns that have these motions, of shape ``(bodies, k)``."""
+        return np.linalg.solve(self.basis, motions[self.tool, self.mode])
+
     def place(self, finite: bool) -> None:
         """Place bodies where they are, in finite strain all, else those of large motions."""
         for i, body in enumerate(self.bodies):
@@ -168,7 +234,10 @@ class Tools:
         return self.poses[body].moved(self.steps()[body] + self.found[body])
 
     def begin_here(self) -> None:
-        """Let a load step begin where the bodies are."""
+        """Let a load step begin where the bodies are, as fast and with the loads that they have."""
+        if self.size:
+            self.speed = self.speed_at_end()
+        self.loads_at_begin = np.array(self.loads)
         self.begin = [self.pose(i) for i in range(len(self))]
 
     def go_back(self, motions: Array | None = None) -> None:
@@ -186,15 +255,18 @@ class Tools:
         """Return the unknowns where the load step began, shape ``(num_unknowns,)``."""
         both = [[pose.motion for pose in poses] for poses in (self.begin, self.poses)]
         began, placed = np.array(both).reshape(2, *self.law.shape)
-        return np.linalg.solve(self.basis, (began - placed)[self.tool, self.mode])
+        return self._unknowns(began - placed)
 
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""
-        contacts = [np.flatnonzero(self.of_contact == i) for i in range(len(self))]
-        return [
-            ToolMotion(body.name, self.pose(i).motion, self.poses[i].centre, contacts[i])
-            for i, body in enumerate(self.bodies)
-        ]
+        velocity = np.zeros(self.law.shape)
+        velocity[self.tool, self.mode] = self.basis @ self.speed_at_end()
+        found = list[ToolMotion]()
+        for i, body in enumerate(self.bodies):
+            contacts, pose = np.flatnonzero(self.of_contact == i), self.pose(i)
+            at, speed = self.poses[i].centre, None if body.mass is None else velocity[i]
+            found.append(ToolMotion(body.name, pose.motion, at, contacts, speed))
+        return found
 
     def take(self, values: Array) -> None:
         """Take the unknowns of a solution, this rank's, shape ``(num_local,)``. Collective."""

@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.contact.records import mean_of_copies, relative_displacement
-from tfeti_dolfinx.contact.rigid_body import RigidBody
+from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.dual import Dual, contact_set
@@ -42,8 +42,22 @@ from tfeti_dolfinx.system import System
 NAMES = ("load", "contact", "friction", "supports", "predictor")
 
 
+def _kinetics(
+    M: Any, size: float, v: Array, start: Array, end: Array, way: Array, drift: Array, load: Array
+) -> Array:
+    """Kinetic energy at the end and at the begin of a step, work of the load and the predictor.
+
+    Velocities are that at the begin, that which the step starts with, and that at the end; without
+    forces ``way`` is ``drift``.
+    """
+    moving, started = v @ (M @ v), start @ (M @ start)
+    predicted = -2.0 / size**2 * (drift - size * start) @ (M @ (way - drift))
+    predicted += 0.5 * (started - moving)
+    return np.array([0.5 * end @ (M @ end), 0.5 * moving, load @ way, predicted])
+
+
 def balance(
-    forms: InertialForms | InertialNewtonForms, dual: Dual, solution: Solution
+    forms: InertialForms | InertialNewtonForms, dual: Dual, solution: Solution, tools: Tools
 ) -> dict[str, float]:
     """Energies at the end of a step, and the work that has changed them. Collective.
 
@@ -56,29 +70,30 @@ def balance(
     inertia, motion = forms.inertia, forms.inertia.motion
     u, v = solution.dofs.to_dolfinx(solution.u), solution.v
     assert v is not None
-    start, way = motion.start, u - motion.u
-    kicked = motion.towards - motion.u - motion.size * start
+    way, drift, own_tools = u - motion.u, motion.towards - motion.u, slice(tools.num_local)
     sets, primal = dual.constraints.sets, solution.dofs.to_primal(way)
-    done = -solution.lam * dual.constraints.jumps(primal[dual.subdomains.trace])  # −λᵀB Δu
-    M, moving = inertia.M, motion.v @ (inertia.M @ motion.v)
+    all_way = np.append(primal, tools.way()[own_tools])
+    done = -solution.lam * dual.constraints.jumps(all_way[dual.subdomains.trace])  # −λᵀB Δu
     of_rows = [done[r].sum() for r in (sets.normals, sets.tangents.ravel(), sets.equalities)]
     # rows know nothing of prescribed components: supports that draw nodes bear their friction
     rubs = 0.0
     if solution.friction is not None:
         records = solution.gluing.records
         along = relative_displacement(records, solution.dofs, primal) + records.motion
+        rigid = tools.entries(records)
+        np.add.at(along, rigid.condition, rigid.direction * tools.way()[rigid.unknown, None])
         rubs = np.sum(solution.tangential_force * along) - of_rows[1]
-    own = [
-        0.5 * v @ (M @ v),
-        forms.elastic(u),
-        0.5 * moving + forms.elastic(motion.u),
-        0.5 * (motion.load + inertia.ends) @ way,
-        *np.add(of_rows, (0.0, rubs, -rubs)),
-        (0.0 if start is motion.v else 0.5 * (start @ (M @ start) - moving))
-        - 2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
-    ]
-    values = [float(value) for value in summed(solution.dofs.comm, np.array(own))]
-    (kinetic, elastic, before), work = values[:3], values[3:]
+    of_nodes = (motion.v, motion.start, v, way, drift, 0.5 * (motion.load + inertia.ends))
+    both = _kinetics(inertia.M, motion.size, *of_nodes)
+    if tools.num_local:
+        load = 0.5 * (tools.loads_at_begin + tools.loads)
+        of_tools = (tools.speed, tools.start, tools.speed_at_end(), tools.way(), tools.drift, load)
+        both += _kinetics(tools.mass, motion.size, *of_tools)
+    own = [forms.elastic(u), forms.elastic(motion.u), *np.add(of_rows, (0.0, rubs, -rubs)), *both]
+    elastic, before, *rows, kinetic, moving, load_work, predicted = map(
+        float, summed(solution.dofs.comm, np.array(own))
+    )
+    before, work = before + moving, [load_work, *rows, predicted]
     return {
         "size": motion.size,
         "kinetic": kinetic,
@@ -130,12 +145,13 @@ class Predictor:
         lam = self.rows_and_start[1]
         return lam, self._dual.last.multiple(self._dofs.comm, lam)
 
-    def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
-        """Return the nearest displacement to w.
+    def nearest(self, w: Array, M: csr_array, gluing: Gluing, tools: Tools) -> Array:
+        """Return the nearest displacement to w; free rigid bodies drift to where theirs is.
 
         w is in DOLFINx's order, as is this rank's mass M, whose factors are kept while it is the
         same object; right sides of the rows are as before afterwards.
         """
+        bodies = tools.of_mass_alone() if tools.num_unknowns else None
         dofs, settings, constraints = self._dofs, self._settings, gluing.constraints
         before, f = np.array(constraints.c), M @ w
         values = mean_of_copies(dofs, dofs.to_primal(w)).ravel()
@@ -146,9 +162,11 @@ class Predictor:
                 self.destroy()
                 data = subdomain_data(dofs, M, f, constraints.trace)
                 equals = EqualSubdomains(settings.inverses())
-                self._subdomains, self._M = settings.make_subdomains(data, dofs, equals), M
+                self._subdomains = settings.make_subdomains(data, dofs, equals, tools=bodies)
+                self._M = M
             assert self._subdomains is not None
-            self._subdomains.update(f=dofs.to_primal(f))
+            own = bodies.load[: bodies.num_local] if bodies else np.zeros(0)
+            self._subdomains.update(f=np.append(dofs.to_primal(f), own))
             if self._dual is not None and self._dual.constraints is constraints:
                 self._dual.update_load()
             else:
@@ -175,7 +193,11 @@ class Predictor:
             self.last = result.lam.copy(), result.face
             self.multiplications = dual.F.count
             conclude(result, accuracy, options, dofs.comm)
-            return dofs.to_dolfinx(accuracy.u)
+            nodal = self._subdomains.num_nodal
+            if bodies:
+                bodies.take(accuracy.u[nodal:])
+                tools.drift = bodies.way()
+            return dofs.to_dolfinx(accuracy.u[:nodal])
         finally:
             constraints.c[:] = before
 
@@ -268,13 +290,6 @@ class ContactDynamics(ContactProblem):
         flags = {"stabilised": self._stabilised, "lumped": self._lumped}
         for name, flag in flags.items():
             checked_flag(flag, name)
-        for contact in self.contacts:
-            shape = getattr(contact, "shape", None)
-            if isinstance(shape, RigidBody) and shape.free:
-                raise InputError(
-                    f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which "
-                    "knows no mass of it; expected displacement= or rotation= without free="
-                )
         return {**flags, "mass": self._mass, "velocity": self._velocity}
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
@@ -310,12 +325,13 @@ class ContactDynamics(ContactProblem):
         inertia, system = self._system.forms.inertia, self._system
         motion = inertia.motion
         motion.towards = free = motion.free
+        system.tools.set_out(motion.size)
         if self._predictor is not None:  # what contact allows the bodies without elasticity
             system.make_up_to("right side", self._seconds)
             if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
                 system.change("constraints")
                 system.make_up_to("right side", self._seconds)
-            motion.towards = self._predictor.nearest(free, inertia.M, system.gluing)
+            motion.towards = self._predictor.nearest(free, inertia.M, system.gluing, system.tools)
         system.change("load")
 
     def accept(self) -> None:
@@ -334,7 +350,9 @@ class ContactDynamics(ContactProblem):
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._system.forms.inertia.motion, super().state()
         v, load = self.dofs.to_primal(motion.v), self.dofs.to_primal(motion.load)
+        tools = self._system.tools
         state = replace(state, velocity=v, load=load, size=np.array(motion.size))
+        state = replace(state, tool_speed=tools.speed, tool_loads=tools.loads_at_begin)
         if self._predictor is None:
             return state
         predicted, image = self._predictor.start
@@ -358,8 +376,11 @@ class ContactDynamics(ContactProblem):
     def _check_state(self, state: SavedState) -> None:
         super()._check_state(state)
         size = len(self.u.x.array)
+        tools = self._system.tools.speed.shape
         if state.velocity.shape != (size,) or state.load.shape != (size,):
             raise InputError("the state is of a problem without mass; expected velocities")
+        if state.tool_speed.shape != tools or state.tool_loads.shape != tools:
+            raise InputError("the state is of other rigid bodies; expected those of the problem")
 
     def _take_motion(self, state: SavedState) -> None:
         inertia = self._system.forms.inertia
@@ -367,6 +388,9 @@ class ContactDynamics(ContactProblem):
         inertia.motion.towards = inertia.motion.free
         if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
             inertia.motion.size = float(state.size)
+        tools = self._system.tools
+        tools.speed, tools.loads_at_begin = state.tool_speed, state.tool_loads
+        tools.set_out(inertia.motion.size)
         super()._take_motion(state)
 
     def destroy(self) -> None:
@@ -384,7 +408,8 @@ class ContactDynamics(ContactProblem):
 
     def _look(self) -> None:
         """Put energies, work and forces into the report."""
-        motion = balance(self._system.forms, self._system.dual, self.solution)
+        system = self._system
+        motion = balance(system.forms, system.dual, self.solution, system.tools)
         if self._predictor is not None:
             motion["predictor_multiplications"] = float(self._predictor.multiplications)
         contact, forces = self.solution.gluing.records.contact, self.solution.condition_forces
@@ -445,6 +470,12 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         flags = {"stabilised": stabilised, "lumped": lumped, "finite": finite}
         given = {"mass": mass, "velocity": velocity, **flags, **others}
         super().__init__(F, u, bcs, contacts, decomposition, **given)
+        tools = self._system.tools
+        if finite and decomposition.mesh.geometry.dim == 3 and np.any(tools.mode >= 3):
+            raise InputError(
+                f"{tools.free_names[0]}: turns of a rigid body with mass in finite strain in 3D; "
+                "expected free translations alone"
+            )
         self._system.forms.inertia.motion.load = self._system.forms.forces()
         self._blows: list[Array] = []
 
@@ -480,6 +511,8 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         if predictor is None or predictor.last is None:
             return
         motion.start = (motion.towards - motion.u) / motion.size
+        tools = self._system.tools
+        tools.start = tools.drift / motion.size
         (lam, face), w = predictor.last, self.dofs.to_primal(motion.towards)
         forces, gluing = lam / motion.size**2, self._system.gluing
         struck = ContactProblem._make_solution(self, w, forces, face, gluing)

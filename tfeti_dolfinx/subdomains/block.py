@@ -306,15 +306,22 @@ class Block:
 class RigidBlock(Block):
     """A rigid body. K = 0 and R = I: it adds nothing to F, and its motions to G.
 
-    Load and mode are those of each unknown, shape ``(n,)``.
+    With a mass, in a step in time, K is definite, and there is no kernel. Load and mode are those
+    of each unknown, shape ``(n,)``, K of shape ``(n, n)``.
     """
 
-    def __init__(self, name: str, load: Array, mode: Array, num_modes: int) -> None:
+    def __init__(self, name: str, load: Array, mode: Array, num_modes: int, K: Array) -> None:
         self.name, self.bs, n = name, 1, len(load)
         self.x = np.zeros((n, 1))
         self.trace_dofs = np.arange(n)
         self.modes = np.eye(num_modes)[mode]
         self.shares = np.ones(n)
-        self.multiply = self.solve = self.apply_schur = np.zeros_like
         self.update(load)
-        self.kernel, self.diagonal = np.eye(n), np.zeros(n)
+        self.kernel, self.diagonal = np.eye(n), np.diag(K)
+        self.multiply = self.solve = self.apply_schur = np.zeros_like
+        if np.any(K):
+            inverse, self.kernel = np.linalg.inv(K), np.zeros((n, 0))
+            self.multiply, self.solve = K.__matmul__, inverse.__matmul__
+            self.apply_schur = lambda w: np.linalg.solve(
+                inverse[np.ix_(self.trace_dofs, self.trace_dofs)], w
+            )
