@@ -117,7 +117,8 @@ def test_contact_rows_are_unit_and_orthogonal_to_the_gluing():
     scene = Scene(contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
     B, N = scene.B[scene.rows("equalities")], scene.B[scene.rows("normals")]
     # one for each node however it is torn, but for those that are clamped
-    assert len(N) == 5 * 5 - scene.d.comm.allreduce(len(scene.gluing.contact.decided)) == 20
+    decided = scene.gluing.constraints.contact.decided
+    assert len(N) == 5 * 5 - scene.d.comm.allreduce(len(decided)) == 20
     area = scene.gluing.records.area
     assert scene.d.comm.allreduce(area.sum()) == pytest.approx(1.0)
     assert np.allclose(np.linalg.norm(N, axis=1), 1.0)
@@ -130,7 +131,7 @@ def test_contact_rows_measure_the_approach_in_scaled_lengths():
     scene = Scene(contacts=[plane], clamped=False)
     rows = scene.rows("normals")
     u = nodal(scene.dofs, lambda x: np.column_stack((x[:, 0], x[:, 1], -0.3 - x[:, 0])))
-    scale = gathered(scene.gluing.contact.scale)
+    scale = gathered(scene.gluing.constraints.scale)
     approach = (scene.B @ scene.trace(u))[rows] / scale
     assert np.allclose(scene.rhs[rows] / scale, 0.1)
     assert approach.min() == pytest.approx(0.3)
@@ -145,8 +146,8 @@ def test_prescribed_components_move_into_the_gap():
     bcs = [roller(dofs.V, 0, d.facets("bottom"), 1.0)]
     gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
     rows = gluing.constraints.sets.normals
-    gap = gluing.constraints.c[rows] / gluing.contact.scale
-    assert np.allclose(gap, records.gap[gluing.contact.condition] + 0.6 * 1.0)
+    gap = gluing.constraints.c[rows] / gluing.constraints.scale
+    assert np.allclose(gap, records.gap[gluing.constraints.contact.normals] + 0.6 * 1.0)
 
 
 # the rows alone matter: no step of the solver is made

@@ -67,7 +67,7 @@ def glued(cell, n, subdomains, limit, kind=HalfSpaces):
 def test_glue_that_lets_go_at_a_limit(limit, kind):
     p = glued("hexahedron", 4, 6, lambda: limit, kind)
     noise = 1e-7 * p.solve().x.petsc_vec.norm(3)
-    rows = p.solution.gluing.contact.condition
+    rows = p.solution.gluing.constraints.contact.normals
     force, gap = p.solution.force[rows], p.solution.remaining_gap[rows]
     assert np.all(gap >= -noise)
     assert np.allclose(force[gap > noise], -limit, rtol=1e-9)

@@ -74,10 +74,10 @@ def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
     records = searched([wall], dofs)
     held, ones = prescribe(dofs, [clamp(dofs.V, d.facets("left"))]), np.ones(dofs.num_nodes * 3)
     gluing = glue(dofs, held, records, 1.0, ones)
-    assert d.comm.allreduce(len(gluing.contact.decided)) == 0
+    assert d.comm.allreduce(len(gluing.constraints.contact.decided)) == 0
     far = searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs)
     near = glue(dofs, held, far, 1.0, ones)
-    assert d.comm.allreduce(len(near.contact.decided)) == 16
+    assert d.comm.allreduce(len(near.constraints.contact.decided)) == 16
     c = np.array(near.constraints.c)
     values = np.array(near.prescribed.value)
     values[:, 0] -= 0.75

@@ -38,14 +38,14 @@ def test_rows_measure_slips(cell, degree):
     pair = sided("upper bottom", "lower top", friction=TRESCA)
     records = searched([pair, smooth], dofs)
     gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
-    rows, sets = gluing.tangents, gluing.constraints.sets
-    assert sets.tangents.shape == (len(rows.condition), dofs.bs - 1)
-    rough = records.contact[gluing.contact.condition] == 0
-    assert np.array_equal(rows.condition, gluing.contact.condition[rough])
-    assert np.array_equal(rows.scale, gluing.contact.scale[rough])
+    rows, sets = gluing.constraints.contact, gluing.constraints.sets
+    assert sets.tangents.shape == (len(rows.points), dofs.bs - 1)
+    rough = records.contact[gluing.constraints.contact.normals] == 0
+    assert np.array_equal(rows.points, gluing.constraints.contact.normals[rough])
+    assert np.array_equal(rows.tangent_scale, gluing.constraints.scale[rough])
     u = nodal(dofs, lambda x: np.cos(2.0 * x) - np.roll(x, 1, axis=1))
-    found = times_rows(gluing, u)[sets.tangents] / rows.scale[:, None]
-    expected = slips(records, dofs, u)[rows.condition]
+    found = times_rows(gluing, u)[sets.tangents] / rows.tangent_scale[:, None]
+    expected = slips(records, dofs, u)[rows.points]
     assert MPI.COMM_WORLD.allreduce(expected.size) > 0
     assert np.allclose(found, expected, rtol=0, atol=1e-12)
 
@@ -71,17 +71,18 @@ class Held:
 def test_a_prescribed_tangent_leaves_a_row_without_entries(value):
     """On the left side x is held: the disc becomes an interval, or is whole where x is drawn."""
     held = Held(TRESCA, left=(0, value))
-    rows, sets = held.gluing.tangents, held.gluing.constraints.sets
-    on_left = group_points(held.dofs)[held.records.group[rows.condition], 0] < 1e-9
+    rows, sets = held.gluing.constraints.contact, held.gluing.constraints.sets
+    on_left = group_points(held.dofs)[held.records.group[rows.points], 0] < 1e-9
     assert held.count(on_left) == 3
     assert held.count(~rows.moves) == 3
-    along_x = np.abs(held.records.tangents[rows.condition, :, 0]) > 0.5
+    along_x = np.abs(held.records.tangents[rows.points, :, 0]) > 0.5
     assert np.array_equal(~rows.moves, along_x & on_left[:, None])
-    bound, _ = rows.bounds(np.full((len(held.records), 2), 0.5), held.records.area)
+    held.gluing.bound_friction(np.full((len(held.records), 2), 0.5), held.records.area)
+    bound = held.gluing.constraints.limits
     assert np.all((bound > 0.0) == (rows.moves | (value > 0.0)))
-    expected = 0.5 * held.records.area[rows.condition] / rows.scale
+    expected = 0.5 * held.records.area[rows.points] / rows.tangent_scale
     assert np.allclose(bound.max(axis=1, initial=0.0), expected)
-    slip = np.abs(held.gluing.constraints.c[sets.tangents]) / rows.scale[:, None]
+    slip = np.abs(held.gluing.constraints.c[sets.tangents]) / rows.tangent_scale[:, None]
     assert np.allclose(slip, np.where(rows.moves, 0.0, value))
 
 
@@ -102,10 +103,10 @@ def test_no_friction_across_a_plane_of_symmetry(cell, counts):
         given = prescribe(dofs, bcs, ends)
         assert (given.across is None) == kept
         gluing = glue(dofs, given, records, 1.0, weights_of(dofs))
-        rows = gluing.tangents
-        on_plane = np.abs(group_points(dofs)[records.group[rows.condition], 1]) < 1e-9
+        rows = gluing.constraints.contact
+        on_plane = np.abs(group_points(dofs)[records.group[rows.points], 1]) < 1e-9
         assert d.comm.allreduce(int(on_plane.sum())) > 2
-        along_y = np.abs(records.tangents[rows.condition, :, 1]) > 0.5
+        along_y = np.abs(records.tangents[rows.points, :, 1]) > 0.5
         assert np.all(rows.moves[along_y & on_plane[:, None]] == kept)
         assert np.all(rows.moves[~along_y | ~on_plane[:, None]])
         gluing.constraints.B.destroy()
@@ -132,23 +133,23 @@ def test_prescribed_values_slip():
 
     u = nodal(dofs, motion)
     # corners are on both grids: the upper box moves there as the lower one does
-    rows = gluing.tangents
-    found = times_rows(gluing, u)[gluing.constraints.sets.tangents] / rows.scale[:, None]
+    rows = gluing.constraints.contact
+    found = times_rows(gluing, u)[gluing.constraints.sets.tangents] / rows.tangent_scale[:, None]
     whole = slips(records, dofs, u)
-    assert np.allclose(found, whole[rows.condition], rtol=0, atol=1e-12)
+    assert np.allclose(found, whole[rows.points], rtol=0, atol=1e-12)
     # a load step that begins elsewhere
     begin = np.cos(1.0 + whole)
     later = gluing.with_right_side(gluing.prescribed.value, records.gap, (begin, begin))
-    found = times_rows(later, u)[gluing.constraints.sets.tangents] / rows.scale[:, None]
-    assert np.allclose(found, (whole - begin)[rows.condition], rtol=0, atol=1e-12)
+    found = times_rows(later, u)[gluing.constraints.sets.tangents] / rows.tangent_scale[:, None]
+    assert np.allclose(found, (whole - begin)[rows.points], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(("law", "rows"), [(TRESCA, 9), (COULOMB, 0)])
 def test_a_node_whose_normal_motion_is_prescribed(law, rows):
     """A given bound holds there; a pressure that hides in what holds the node bounds nothing."""
     held = Held(law, bottom=(2, 0.0))
-    assert held.count(np.ones(len(held.gluing.contact.condition))) == 0
-    assert held.count(np.ones(len(held.gluing.tangents.condition))) == rows
+    assert held.count(np.ones(len(held.gluing.constraints.contact.normals))) == 0
+    assert held.count(np.ones(len(held.gluing.constraints.contact.points))) == rows
 
 
 def test_the_first_tangent_follows_the_direction():

@@ -58,7 +58,7 @@ class Sizes:
             "contact_rows": len(constraints.sets.normals),
             "contact_candidates": records.candidates,
             "far_contact_nodes": records.candidates - int(np.sum(records.within_reach)),
-            "dropped_contact_rows": len(gluing.contact.decided),
+            "dropped_contact_rows": len(constraints.contact.decided),
             "tangential_rows": constraints.sets.tangents.size,
         }
         total = summed(comm, np.array(list(own.values())))
@@ -428,13 +428,13 @@ def _local_operators(dual: Dual) -> dict[str, float]:
 def _residuals(
     solution: Solution, dual: Dual, result: QPResult, accuracy: Accuracy
 ) -> dict[str, float]:
-    comm, gap, rows = solution.dofs.comm, solution.remaining_gap, solution.gluing.contact
+    comm, gap, constraints = solution.dofs.comm, solution.remaining_gap, solution.gluing.constraints
     reference = result.reference or 1.0
     checks = Accuracy.criteria(accuracy) | accuracy.checks  # of errors that are not checked, too
     # of a set of one's own, as of glue that lets go, a force may pull, across a gap too
     missing = dual.feasible.project(solution.lam) - solution.lam
-    missing = rows.scale * missing[solution.gluing.constraints.sets.normals]
-    tension = quotient(missing, solution.area[rows.condition])
+    missing = constraints.scale * missing[constraints.sets.normals]
+    tension = quotient(missing, solution.area[constraints.contact.normals])
     closed = solution.status_of_conditions != ContactStatus.OPEN
     # how far copies of a node are apart, and from prescribed values
     dofs, prescribed = solution.dofs, solution.gluing.prescribed

@@ -78,7 +78,7 @@ def labels_of_rows(gluing: Gluing, of_groups: Array) -> dict[str, Array]:
     group[sets.equalities] = np.repeat(of_groups, count)
     kind[sets.equalities] = -1
     place[sets.equalities] = np.arange(len(sets.equalities))
-    normal, tangent = gluing.contact.condition, gluing.tangents.condition
+    normal, tangent = gluing.constraints.contact.normals, gluing.constraints.contact.points
     group[sets.normals] = of_groups[records.group[normal]]
     kind[sets.normals] = 2 * records.contact[normal]
     group[sets.tangents] = of_groups[records.group[tangent]][:, None]

@@ -443,9 +443,9 @@ class Solution:
         It is 0 without a constraint, but where held vertices touch: they bear what their neighbours
         do.
         """
-        rows, records = self.gluing.contact, self.gluing.records
+        rows, records = self.gluing.constraints, self.gluing.records
         force = np.zeros(len(records))
-        force[rows.condition] = rows.scale * self.lam[self.gluing.constraints.sets.normals]
+        force[rows.contact.normals] = rows.scale * self.lam[rows.sets.normals]
         if any_rank(self.dofs.comm, len(records.held) > 0):
             pressure, contacts = quotient(force, self.area), len(self.contacts)
             borne, at = held_pressures(records, self.dofs, contacts, pressure), self.gluing.closed()
@@ -458,11 +458,11 @@ class Solution:
 
         Collective at first use.
         """
-        rows, records = self.gluing.tangents, self.gluing.records
+        rows, records = self.gluing.constraints.contact, self.gluing.records
         lam = self.lam[self.gluing.constraints.sets.tangents]
         force = np.zeros(records.normal.shape)
-        along = np.einsum("tk,tkg->tg", lam, records.tangents[rows.condition])
-        force[rows.condition] = -rows.scale[:, None] * along
+        along = np.einsum("tk,tkg->tg", lam, records.tangents[rows.points])
+        force[rows.points] = -rows.tangent_scale[:, None] * along
         return force + self.forced_friction
 
     @cached_property
@@ -543,12 +543,12 @@ class Solution:
         Of a node that sticks it is what it was: else a step would take the algebraic error of the
         one before for a slip. Collective at first use.
         """
-        gluing, rows = self.gluing, self.gluing.tangents
+        gluing, rows = self.gluing, self.gluing.constraints.contact
         at, end = gluing.constraints.sets.tangents, self._motion[1]
         rubs = np.any(self.lam[at] != 0.0, axis=1) & np.all(self.holding[at] | ~rows.moves, axis=1)
         forced, kept = gluing.slip + self.forced_slip, np.zeros(end.shape, dtype=bool)
         end = np.where(np.isnan(forced), end, forced)
-        kept[rows.condition] = rubs[:, None] & rows.moves
+        kept[rows.points] = rubs[:, None] & rows.moves
         return np.where(kept, gluing.slip, end)
 
     @cached_property
@@ -562,17 +562,15 @@ class Solution:
     @cached_property
     def status_of_conditions(self) -> Array:
         """ContactStatus of each contact condition of this rank. Collective at first use."""
-        gluing, sets = self.gluing, self.gluing.constraints.sets
-        status = np.full(len(gluing.records), ContactStatus.OPEN)
-        touching = gluing.contact.condition[self.carrying[sets.normals]]
+        sets, rows = self.gluing.constraints.sets, self.gluing.constraints.contact
+        status = np.full(len(self.gluing.records), ContactStatus.OPEN)
+        touching, decided = rows.normals[self.carrying[sets.normals]], rows.decided
         status[touching] = ContactStatus.TOUCHING
-        decided = gluing.contact.decided
         status[decided[self.force[decided] > 0.0]] = ContactStatus.TOUCHING
-        rows = gluing.tangents
         sticks = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
         rubbing = np.where(sticks, ContactStatus.STICK, ContactStatus.SLIP)
-        closed = np.isin(rows.condition, np.concatenate((touching, decided)))
-        status[rows.condition[closed]] = rubbing[closed]
+        closed = np.isin(rows.points, np.concatenate((touching, decided)))
+        status[rows.points[closed]] = rubbing[closed]
         status[np.any(self.forced_friction, axis=1)] = ContactStatus.SLIP
         return status
 

@@ -353,7 +353,7 @@ class System(Generic[OwnForms]):
         values, records = made(self._prescribed).value, self.search.records
         gluing = replace(self.gluing, records=replace(self.gluing.records, motion=records.motion))
         self._gluing = gluing.with_right_side(values, records.gap, self._slip())
-        before, after = gluing.tangents.drawn, self._gluing.tangents.drawn
+        before, after = gluing.drawn, self._gluing.drawn
         if self._has_friction and any_rank(self._dofs.comm, not np.array_equal(before, after)):
             self.change("friction")
 
@@ -364,11 +364,8 @@ class System(Generic[OwnForms]):
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
-        rows = gluing.constraints
-        rows.area[:] = area[gluing.contact.condition]
-        if self._has_friction:
-            friction = made(self.known_friction)
-            rows.limits[:], rows.coefficients[:] = gluing.tangents.bounds(friction, area)
+        friction = made(self.known_friction) if self._has_friction else np.zeros(gluing.slip.shape)
+        gluing.bound_friction(friction, area)
 
     def _assemble_load(self) -> None:
         self._f = self.elements.load(self.forms)

@@ -1,12 +1,10 @@
 """Rows of contact: normals and tangents."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.constraints.rows import TOLERANCES, Rows, stack
+from tfeti_dolfinx.constraints.rows import TOLERANCES, ContactRows, Rows, stack
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.contact.tools import RigidEntries
 from tfeti_dolfinx.forms.dirichlet import Prescribed
@@ -86,94 +84,40 @@ class RowBuilder:
         return given, np.where(self._prescribed, 0.0, given), own
 
 
-# --- Non-penetration rows ---------------------------------------------------------------------
+# --- Rows of contact: normals, and tangents of conditions with friction ------------------------
 
 
-@dataclass(frozen=True)
-class ContactRows:
-    """Origin of the rows B_N."""
-
-    condition: Array  # condition (of the records) of each row, shape (n,)
-    # the s_i that a condition was multiplied by, shape (n,): one number for all rows of a
-    # condition, that which gives its normal row unit norm. Its force is s_i λ_i
-    scale: Array
-    decided: Array  # conditions of this rank that prescribed components decide alone, without rows
-
-
-def contact_rows(builder: RowBuilder) -> tuple[Rows, ContactRows]:
-    """B_N from the conditions within reach, rows of unit norm in D⁻¹. Collective."""
-    within_reach = builder.records.within_reach
-    squares, left, _ = builder.left(0)
-    condition = np.flatnonzero(within_reach & left)
-    scale = 1.0 / np.sqrt(squares[condition])
-    decided = np.flatnonzero(within_reach & ~left)
-    return builder.rows(0, condition, scale), ContactRows(condition, scale, decided)
-
-
-# --- Tangential rows of conditions with friction ----------------------------------------------
-
-
-@dataclass(frozen=True)
-class TangentRows:
-    """Origin of the rows T."""
-
-    condition: Array  # condition of each point of `RowSets.tangents`, shape (t,)
-    # the s_i of the normal row of the same condition, shape (t,); where prescribed components leave
-    # none, one that gives the longer tangential row unit norm
-    scale: Array
-    # whether prescribed components leave enough of a row (`RowTolerances.little_left`); rows
-    # without entries stay, so that a disc stays a disc, shape (t, gdim - 1)
-    moves: Array
-    # under Coulomb's law the normal row of the same condition, as a position in `RowSets.normals`,
-    # else −1, shape (t,)
-    normal: Array
-    # whether conditions make the node of a row without entries slip along it, while it moves along
-    # the other tangent: friction is then against both slips, shape (t, gdim - 1)
-    drawn: Array
-
-    def bounds(self, values: Array, area: Array) -> tuple[Array, Array]:
-        """Return ψ_i = traction · ∫φ_i / s_i, semi-axes of what λ_T may be, and Coulomb's μ_i.
-
-        Both have the shape ``(t, gdim - 1)``; one of them is 0, and both where nothing can slip.
-        Tractions or coefficients, ``(n, gdim - 1)``, and areas ∫φ_i, ``(n,)``, are those of all
-        conditions.
-        """
-        over = (area[self.condition] / self.scale)[:, None]
-        own, given = values[self.condition], (self.normal < 0)[:, None]
-        slides = self.moves | self.drawn
-        limits = np.where(slides & given, own * over, 0.0)
-        return limits, np.where(slides & ~given, own, 0.0)
-
-
-def tangent_rows(
-    dofs: TornDofs, builder: RowBuilder, normals: ContactRows
-) -> tuple[Rows, TangentRows]:
-    """T from conditions within reach that have friction, given their normal rows. Collective.
+def contact_rows(dofs: TornDofs, builder: RowBuilder) -> tuple[Rows, Rows, ContactRows]:
+    """B_N and T from the conditions within reach, normal rows of unit norm in D⁻¹. Collective.
 
     A condition whose normal row prescribed components decide keeps its tangents under a given
     bound. Under Coulomb's law it has none: the pressure is hidden in what holds the node.
     """
     records, count = builder.records, dofs.bs - 1
+    squares, left, _ = builder.left(0)
+    own = np.flatnonzero(records.within_reach & left)
+    decided, scale = np.flatnonzero(records.within_reach & ~left), 1.0 / np.sqrt(squares[own])
+    normals = builder.rows(0, own, scale)
     if not any_rank(dofs.comm, records.friction != Friction.NONE):
         none, number = np.empty(0, dtype=np.int64), np.empty(0)
         moves = np.empty((0, count), dtype=bool)
-        return Rows(none, none, none, number), TangentRows(none, number, moves, none, moves)
+        contact = ContactRows(own, none, decided, scale, number, none, moves)
+        return normals, Rows(none, none, none, number), contact
     of_axes = [builder.left(1 + k) for k in range(count)]
     squares, left, share = np.array(of_axes).transpose(1, 2, 0)
     left = left * (share > TOLERANCES.little_left) * ~builder.across
     of_normal, row = np.zeros(len(records)), np.full(len(records), -1)
-    of_normal[normals.condition] = normals.scale
-    row[normals.condition] = np.arange(len(normals.condition))
+    of_normal[own], row[own] = scale, np.arange(len(own))
     row[records.friction != Friction.COULOMB] = -1
     rubs = (records.friction == Friction.GIVEN) & records.within_reach
     rubs |= (records.friction == Friction.COULOMB) & (of_normal > 0.0)
-    condition = np.flatnonzero(rubs & np.any(left > 0.0, axis=1))
-    longest = np.sqrt(squares[condition].max(axis=1, initial=0.0))
-    scale, moves = of_normal[condition], left[condition] > 0.0
-    scale = np.where(scale > 0.0, scale, 1.0 / np.maximum(longest, TINY))
-    rows = stack([builder.rows(1 + k, condition, scale * moves[:, k]) for k in range(count)])
+    points = np.flatnonzero(rubs & np.any(left > 0.0, axis=1))
+    longest = np.sqrt(squares[points].max(axis=1, initial=0.0))
+    over, moves = of_normal[points], left[points] > 0.0
+    over = np.where(over > 0.0, over, 1.0 / np.maximum(longest, TINY))
+    rows = stack([builder.rows(1 + k, points, over * moves[:, k]) for k in range(count)])
     # those of a condition one after the other
     place = np.arange(len(rows)).reshape(-1, count).T.ravel()
-    group = np.repeat(records.group[condition], count)
+    group = np.repeat(records.group[points], count)
     rows = Rows(group, place[rows.row], rows.column, rows.value)
-    return rows, TangentRows(condition, scale, moves, row[condition], np.zeros_like(moves))
+    return normals, rows, ContactRows(own, points, decided, scale, over, row[points], moves)

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, count_over, largest, least
-from tfeti_dolfinx.constraints.contact_rows import (
-    ContactRows,
-    RowBuilder,
-    TangentRows,
-    contact_rows,
-    tangent_rows,
-)
+from tfeti_dolfinx.constraints.contact_rows import RowBuilder, contact_rows
 from tfeti_dolfinx.constraints.rows import (
     TOLERANCES,
     Constraints,
@@ -98,21 +92,21 @@ class Gluing:
     records: ContactRecords  # contact conditions of this rank
     # from components of the owned groups, unrolled, to right sides of equality rows, (e, g·bs)
     to_equalities: csr_array
-    contact: ContactRows  # origin of the normal rows
-    tangents: TangentRows  # origin of the tangential rows
     constraints: Constraints  # B, c and the sets of rows
     length: float  # a length of the scene
     # where the load step begins: the tangential v_i of all conditions then, shape (n, gdim - 1), of
     # prescribed components alone where a tangent is prescribed. Friction acts on what comes to it
     slip: Array
+    # whether conditions make the node of a tangential row without entries slip along it, while it
+    # moves along the other tangent: friction is then against both slips, shape (t, gdim - 1)
+    drawn: Array
 
     def right_side(self) -> Array:
         """Return this rank's part of c, shape ``(num_rows,)``. Collective."""
-        sets, records = self.constraints.sets, self.records
-        normals, tangents = self.contact, self.tangents
+        sets, rows, records = self.constraints.sets, self.constraints.contact, self.records
         held, left, rounding = self._held
-        decided, comm = left[normals.decided], self.dofs.comm
-        wrong = decided < -rounding[normals.decided]
+        decided, comm = left[rows.decided], self.dofs.comm
+        wrong = decided < -rounding[rows.decided]
         overlaps = count_over(comm, wrong)
         deepest = least(comm, float(decided.min(initial=0.0)))
         if overlaps:
@@ -123,17 +117,31 @@ class Gluing:
             )
         c = np.zeros(self.constraints.num_rows)
         c[sets.equalities] = self.to_equalities @ self.prescribed.value.ravel()
-        c[sets.normals] = left[normals.condition] * normals.scale
+        c[sets.normals] = left[rows.normals] * rows.scale
         if self.constraints.contact_rows[1]:
-            along, at = np.einsum("ntg,ng->nt", records.tangents, held), tangents.condition
-            slips = np.where(tangents.moves, (self.slip - along)[at], -self._given_slip[at])
-            slides = tangents.moves | tangents.drawn
-            c[sets.tangents] = np.where(slides, slips * tangents.scale[:, None], 0.0)
+            along, at = np.einsum("ntg,ng->nt", records.tangents, held), rows.points
+            slips = np.where(rows.moves, (self.slip - along)[at], -self._given_slip[at])
+            slides = rows.moves | self.drawn
+            c[sets.tangents] = np.where(slides, slips * rows.tangent_scale[:, None], 0.0)
         return c
+
+    def bound_friction(self, values: Array, area: Array) -> None:
+        """Fill ∫φ_i of the rows, the ψ_i = traction · ∫φ_i / s_i, and the μ_i of Coulomb's law.
+
+        Of a point ψ_i or μ_i is 0, and both where nothing can slip. Tractions or coefficients,
+        ``(n, gdim - 1)``, and areas ∫φ_i, ``(n,)``, are those of all conditions.
+        """
+        constraints, rows = self.constraints, self.constraints.contact
+        own, given = values[rows.points], (rows.pressed_by < 0)[:, None]
+        over = (area[rows.points] / rows.tangent_scale)[:, None]
+        slides = rows.moves | self.drawn
+        constraints.area[:] = area[rows.normals]
+        constraints.limits[:] = np.where(slides & given, own * over, 0.0)
+        constraints.coefficients[:] = np.where(slides & ~given, own, 0.0)
 
     def closed(self) -> Array:
         """Return the conditions that prescribed components decide and that touch. Collective."""
-        at, (_, left, rounding) = self.contact.decided, self._held
+        at, (_, left, rounding) = self.constraints.contact.decided, self._held
         return np.asarray(at[np.abs(left[at]) <= rounding[at]])
 
     def prescribed_slip(self) -> Array:
@@ -146,10 +154,10 @@ class Gluing:
 
     def _forced(self) -> Array:
         """Return flags of tangents that are prescribed, of conditions with friction and a row."""
-        forced = np.zeros(self.slip.shape, dtype=bool)
-        forced[self.contact.condition] = True
+        forced, rows = np.zeros(self.slip.shape, dtype=bool), self.constraints.contact
+        forced[rows.normals] = True
         forced[self.records.friction == Friction.NONE] = False
-        forced[self.tangents.condition] &= ~self.tangents.moves
+        forced[rows.points] &= ~rows.moves
         return forced
 
     @cached_property
@@ -190,13 +198,13 @@ class Gluing:
             records=replace(self.records, gap=gaps),
             slip=slip,
         )
-        gluing = replace(gluing, tangents=replace(self.tangents, drawn=gluing._drawn()))
+        gluing = replace(gluing, drawn=gluing._drawn())
         self.constraints.c[:] = gluing.right_side()
         return gluing
 
     def _drawn(self) -> Array:
-        """Return ``TangentRows.drawn``: slips that are more than rounding. Collective."""
-        moves, at = self.tangents.moves, self.tangents.condition
+        """Return ``drawn``: slips that are more than rounding. Collective."""
+        moves, at = self.constraints.contact.moves, self.constraints.contact.points
         if self.dofs.bs < 3 or not self.constraints.contact_rows[1]:
             return np.zeros_like(moves)
         values, motion = self.prescribed.value, self.records.motion
@@ -220,24 +228,25 @@ class Gluing:
         if np.array_equal(sets.springs_of, before.springs_of):
             start[sets.springs] = lam[before.springs]
         # ratios: of rows that stay they are exactly 1, and what F makes of the start is known
-        pairs: list[tuple[Any, Any, Array, Array]] = [
-            (self.contact, earlier.contact, sets.normals[:, None], before.normals[:, None]),
-            (self.tangents, earlier.tangents, sets.tangents, before.tangents),
-        ]
-        for rows, rows_before, to, of in pairs:
-            at = (self.records, rows.condition), (earlier.records, rows_before.condition)
-            # of the contact and the node of each condition; no mesh has so many nodes
-            keys = [(records.contact[kept] << 40) + records.group[kept] for records, kept in at]
-            _, new, old = np.intersect1d(keys[0], keys[1], return_indices=True)
-            ratio = rows_before.scale[old] / rows.scale[new]
-            start[to[new]] = lam[of[old]] * ratio[:, None]
+        for now, then in zip(self._kinds(), earlier._kinds(), strict=True):
+            (keys, scale, to), (keys_then, scale_then, of) = now, then
+            _, new, old = np.intersect1d(keys, keys_then, return_indices=True)
+            start[to[new]] = lam[of[old]] * (scale_then[old] / scale[new])[:, None]
         return start
+
+    def _kinds(self) -> Iterator[tuple[Array, Array, Array]]:
+        """Yield keys of conditions, scales and rows, of normals and of tangents."""
+        sets, rows, records = self.constraints.sets, self.constraints.contact, self.records
+        # of the contact and the node of each condition; no mesh has so many nodes
+        keys = (records.contact << 40) + records.group
+        yield keys[rows.normals], rows.scale, sets.normals[:, None]
+        yield keys[rows.points], rows.tangent_scale, sets.tangents
 
     def contacts_of(self, rows: Array) -> list[int]:
         """Positions, in the user's list, of the contacts that local rows are of. Collective."""
-        sets = self.constraints.sets
-        normals = self.contact.condition[np.isin(sets.normals, rows)]
-        tangents = self.tangents.condition[np.isin(sets.tangents, rows).any(axis=1)]
+        sets, contact = self.constraints.sets, self.constraints.contact
+        normals = contact.normals[np.isin(sets.normals, rows)]
+        tangents = contact.points[np.isin(sets.tangents, rows).any(axis=1)]
         own = np.unique(self.records.contact[np.concatenate((normals, tangents))])
         return sorted(set().union(*self.dofs.comm.allgather(own.tolist())))
 
@@ -261,26 +270,16 @@ def glue(
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
     rigid = tools.entries(records) if tools else None
     builder = RowBuilder(dofs, prescribed, D, records, rigid)
-    normal_rows, contact = contact_rows(builder)
+    normal_rows, sliding_rows, contact = contact_rows(dofs, builder)
     if tools and rigid:
         decided = np.intersect1d(contact.decided, rigid.condition)
         tools.check_nodes(records.contact[decided])
-    sliding_rows, tangents = tangent_rows(dofs, builder, contact)
     equalities, to_equalities = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
-    constraints = assemble_constraints(
-        dofs,
-        tables,
-        weights,
-        contact.scale,
-        tangents.scale,
-        tangents.normal,
-        tools.num_unknowns if tools else 0,
-    )
-    none = np.zeros(records.tangents.shape[:2])
-    gluing = Gluing(
-        dofs, prescribed, records, to_equalities, contact, tangents, constraints, length, none
-    )
+    count = tools.num_unknowns if tools else 0
+    constraints = assemble_constraints(dofs, tables, weights, contact, count)
+    still, drawn = np.zeros(records.tangents.shape[:2]), np.zeros_like(contact.moves)
+    gluing = Gluing(dofs, prescribed, records, to_equalities, constraints, length, still, drawn)
     try:
         return gluing.with_right_side(prescribed.value, records.gap, slip)
     except TfetiError:  # on all ranks

@@ -82,6 +82,26 @@ class RowSets:
         return np.concatenate((self.normals, self.tangents.ravel()))
 
 
+@dataclass(frozen=True)
+class ContactRows:
+    """Rows of contact: the conditions, by their places in the records, that they are of."""
+
+    normals: Array  # condition of each row of `RowSets.normals`, shape (n,)
+    points: Array  # condition of each point of `RowSets.tangents`, shape (t,)
+    decided: Array  # conditions of this rank that prescribed components decide alone, without rows
+    # the s_i that a condition was multiplied by: one number for all rows of a condition, that which
+    # gives its normal row unit norm. Its force is s_i λ_i; over s_i what a row misses is a length
+    scale: Array
+    # the same for each point, shape (t,); where prescribed components leave no normal row, one that
+    # gives the longer tangential row unit norm
+    tangent_scale: Array
+    # under Coulomb's law the normal row of each point, as a position in `normals`, else −1
+    pressed_by: Array
+    # whether prescribed components leave enough of a row (`RowTolerances.little_left`); rows
+    # without entries stay, so that a disc stays a disc, shape (t, gdim - 1)
+    moves: Array
+
+
 # --- Scaling D of rows ------------------------------------------------------------------------
 
 
@@ -120,17 +140,13 @@ class Constraints:
     # D on the local trace unknowns: the rows are scaled with it. Of rigid bodies it is infinite,
     # and D⁻¹, which is what anything is made with, 0
     weights: Array
-    # the s_i of the conditions with rows, one for each of `sets.normals`: over it what a row misses
-    # is a length
-    scale: Array
-    # ∫φ_i of the same conditions, times the thickness; 0 without friction, and a set of one's own
+    contact: ContactRows  # what rows of contact are of
+    # ∫φ_i of the conditions of normals, times the thickness; 0 without friction, and a set of one's
+    # own
     area: Array
-    tangent_scale: Array  # the same for each point of `sets.tangents`, shape (t,)
     # the ψ_i, semi-axes of the sets of the tangential multipliers, shape (t, gdim - 1); 0 until
     # they are set
     limits: Array
-    # under Coulomb's law the local row of the condition's normal, else −1, shape (t,)
-    pressed_by: Array
     coefficients: Array  # the μ_i of Coulomb's law, else 0, shape (t, gdim - 1)
 
     @property
@@ -176,10 +192,15 @@ class Constraints:
         normals, tangents = summed(self.B.getComm().tompi4py(), own)
         return int(normals), int(tangents)
 
-    @cached_property
-    def empty(self) -> Array:
-        """Flags of local rows without entries."""
-        return np.asarray(np.diff(self.B.getValuesCSR()[0]) == 0)
+    @property
+    def scale(self) -> Array:
+        """The s_i of the conditions with rows, one for each of ``sets.normals``."""
+        return self.contact.scale
+
+    @property
+    def pressed_by(self) -> Array:
+        """Under Coulomb's law the local row of each point's normal, else −1, shape ``(t,)``."""
+        return np.append(self.sets.normals, -1)[self.contact.pressed_by]
 
     @property
     def pressed(self) -> Array:
@@ -192,7 +213,7 @@ class Constraints:
         Where no force moves a row it slips whatever bounds it: it has no share of a bound of ∞.
         """
         at, limits = self.pressed, self.limits.copy()
-        sticks = np.isinf(pressures)[:, None] & self.empty[self.sets.tangents[at]]
+        sticks = np.isinf(pressures)[:, None] & ~self.contact.moves[at]
         mu = np.where(sticks, 0.0, self.coefficients[at])
         limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
         return replace(self, limits=limits)
@@ -210,16 +231,14 @@ def assemble_constraints(
     dofs: TornDofs,
     tables: Sequence[Rows],
     weights: Array,
-    scale: Array,
-    tangent_scale: Array,
-    pressed_by: Array,
+    contact: ContactRows,
     rigid: int = 0,
 ) -> Constraints:
     """Assemble B of this rank's rows, with c = 0 and ψ = 0. Collective.
 
     The tables are those of equalities, contact normals and tangents; the weights are D on the local
-    primal unknowns, the other arguments as in ``ContactRows`` and ``TangentRows``. ``rigid`` counts
-    unknowns of rigid bodies, on the last rank behind those of its nodes.
+    primal unknowns. ``rigid`` counts unknowns of rigid bodies, on the last rank behind those of its
+    nodes.
     """
     rows = stack(list(tables))
     used = rows.value != 0.0
@@ -249,18 +268,14 @@ def assemble_constraints(
         csr=(indptr.astype(index), column[order].astype(index), rows.value[order]),
         comm=dofs.comm,
     )
-    shape, row = sets.tangents.shape, pressed_by.copy()
-    row[row >= 0] = sets.normals[row[row >= 0]]
     return Constraints(
         B=B,
         c=np.zeros(num_rows),
         sets=sets,
         trace=trace,
         weights=weights[trace],
-        scale=scale,
-        area=np.zeros(len(scale)),
-        tangent_scale=tangent_scale,
-        limits=np.zeros(shape),
-        pressed_by=row,
-        coefficients=np.zeros(shape),
+        contact=contact,
+        area=np.zeros(len(normals)),
+        limits=np.zeros(sets.tangents.shape),
+        coefficients=np.zeros(sets.tangents.shape),
     )

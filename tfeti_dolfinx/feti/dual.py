@@ -53,7 +53,7 @@ class DualLimits:
 LIMITS = DualLimits()
 
 # from B and c to the set of multipliers, on all local rows; rows of no set are free, and hold what
-# they multiply. A row's force is s_i λ_i (``Constraints.scale``, ``tangent_scale``)
+# they multiply. A row's force is s_i λ_i (``scale`` and ``tangent_scale`` of ``ContactRows``)
 FeasibleLaw = Callable[[Constraints], FeasibleSet]
 
 

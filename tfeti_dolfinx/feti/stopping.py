@@ -109,7 +109,8 @@ def measure(
     begin = float(np.max(np.abs(dual.begin), initial=0.0)) if state.loose.count else 0.0
     if tangents.size:
         w[tangents] = norm * within(dual.feasible, state.lam, tangents, w[tangents] / norm)
-        slips = np.linalg.norm((w[tangents], c[tangents]), axis=2) / constraints.tangent_scale
+        slips = np.linalg.norm((w[tangents], c[tangents]), axis=2)
+        slips /= constraints.contact.tangent_scale
         penetration, begin = max(penetration, slips[0].max()), max(begin, slips[1].max())
     largest = np.array([penetration, gap, begin])
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)

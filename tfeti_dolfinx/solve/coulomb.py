@@ -397,7 +397,7 @@ class NewtonOnLaw:
         if (norm := dual.seen) == 0.0:
             return None
         # what is made to slip along a row without entries
-        drawn = np.any(rows.empty[tangents] & (rows.c[tangents] != 0.0), axis=1)
+        drawn = np.any(~rows.contact.moves[at] & (rows.c[tangents] != 0.0), axis=1)
         reach = np.ones(rows.num_rows)
         reach[tangents[drawn]] = PARAMETERS.reach
         program = LawProgram(qp, law, dual.coarse.oblique, norm, reach)
