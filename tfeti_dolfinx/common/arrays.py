@@ -17,8 +17,6 @@ Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
-# multiplications that take as long as a call of PETSc, and as to make two dense matrices of it
-CALL, DENSE = 2_000, 30_000
 EPSILON = float(np.finfo(float).eps)  # relative rounding of a number
 
 
@@ -162,8 +160,6 @@ class LocalMatrix:
 
     def __matmul__(self, x: Array) -> Array:
         """A x, shapes ``(n,)`` or ``(n, q)``."""
-        if x.ndim > 1 and self._is_little(x):
-            return np.array([self @ column for column in x.T]).T
         if x.ndim > 1:
             return of_columns(self._petsc.matMult, x, self.shape[0])
         self._x.setArray(x)
@@ -172,17 +168,11 @@ class LocalMatrix:
 
     def transposed(self, y: Array) -> Array:
         """Aᵀy, shapes ``(m,)`` or ``(m, q)``."""
-        if y.ndim > 1 and self._is_little(y):
-            return np.array([self.transposed(column) for column in y.T]).T
         if y.ndim > 1:
             return of_columns(self._petsc.transposeMatMult, y, self.shape[1])
         self._y.setArray(y)
         self._petsc.multTranspose(self._y, self._x)
         return np.array(self._x.array_r)
-
-    def _is_little(self, x: Array) -> bool:
-        """Return whether products with columns, not none, take less time one by one."""
-        return 0 < (CALL + self.count) * x.shape[1] < DENSE
 
     def part(self, rows: Array, columns: Array) -> PETSc.Mat:
         """Return A[rows][:, columns]."""
