@@ -94,10 +94,8 @@ def test_no_friction_across_a_plane_of_symmetry(cell, counts):
     """
     d = stacked(cell, *counts, 6)
     dofs = dofs_on(d)
-    records, ends = (
-        searched([sided("upper bottom", "lower top", friction=COULOMB)], dofs),
-        EndPlanes(dofs),
-    )
+    records = searched([sided("upper bottom", "lower top", friction=COULOMB)], dofs)
+    ends = EndPlanes(dofs)
     upper, lower = (roller(dofs.V, 1, d.facets(f"{name} front")) for name in ("upper", "lower"))
     for bcs, kept in (([upper, lower], False), ([upper], True), ([lower], True)):
         given = prescribe(dofs, bcs, ends)
