@@ -67,6 +67,7 @@ SOLVED = {
     LAW: lambda s: solved(
         s, a=tfeti.Elasticity(s.d, E=1.0, nu=0.3, model="axisymmetric").a(s.u, s.v)
     ),
+    LAW + " law": lambda s: solved(s, a=s.a + 1e-6 * ufl.dot(s.u, s.v) * s.dx),
     r"boundary elements for 2 components of degree 2; expected displacements of": of_degree_two,
     r"subdomain \d: a load per volume varies there; boundary elements take a constant": lambda s: (
         solved(s, L=ufl.SpatialCoordinate(s.d.mesh)[0] * s.v[1] * s.dx)

@@ -31,6 +31,7 @@ class StiffnessTolerances:
             triangles may make them.
         same: Of the largest entry of a stiffness: what rounding and quadrature of a constant
             stress leave.
+        rest: The same of forces of translations, which no elasticity has: what rounding leaves.
         constant: Of the largest entry of a load: what quadrature leaves of a constant force per
             volume.
         together: Right sides that are solved for at once.
@@ -38,6 +39,7 @@ class StiffnessTolerances:
 
     wrong: float = 1e-2
     same: float = 1e-7
+    rest: float = 1e-12
     constant: float = 1e-7
     together: int = 256
 
@@ -264,8 +266,10 @@ def law_of(K: Any, surface: Surface, name: str) -> IsotropicLaw:
     expected = np.zeros_like(forces)
     stress = law.stress(np.eye(d * d).reshape(d * d, d, d))
     expected[:, : d * d] = np.einsum("lki,ni->nkl", stress, surface.normals).reshape(-1, d * d)
-    most = TOLERANCES.same * np.max(abs(K) @ np.abs(moved))
-    if not (law.mu > 0.0 and -1.0 < law.nu < 0.5 and np.abs(forces - expected).max() <= most):
+    most = np.repeat((TOLERANCES.same, TOLERANCES.rest), (d * d, d))  # of strains, of translations
+    most *= np.max(abs(K) @ np.abs(moved))
+    right = np.all(np.abs(forces - expected) <= most)
+    if not (law.mu > 0.0 and -1.0 < law.nu < 0.5 and right):
         raise InputError(
             f"{name}: boundary elements need one homogeneous, isotropic law, without "
             "springs or masses; the bilinear form has something else there. Expected "
