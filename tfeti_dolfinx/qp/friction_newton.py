@@ -132,9 +132,10 @@ def newton_on_law(program: LawProgram, at: LawPoint, target: float) -> tuple[Law
     and the steps taken.
     """
     best, idle, past = np.inf, 0, list[float]()
+    # Step 1: the natural map: what a gradient step, brought back, moves, and what Gλ lacks
+    moved = program.natural_map(at)
     for step in range(PARAMETERS.max_steps):
-        # Step 1: the natural map: what a gradient step, brought back, moves, and what Gλ lacks
-        feasible, p, residual = program.natural_map(at)
+        feasible, p, residual = moved
         if residual <= target:
             return at, step
         idle = 0 if residual < PARAMETERS.progress * best else idle + 1
@@ -154,14 +155,16 @@ def newton_on_law(program: LawProgram, at: LawPoint, target: float) -> tuple[Law
             return None, step + 1
         # Step 4: halve the step until its residual is none of the largest; F is known on all of it
         past = [*past[1 - PARAMETERS.memory :], residual]
-        part, there = 1.0, end
-        while not program.natural_map(there)[2] <= max(past):
+        part, there, whole = 1.0, end, program.natural_map(end)
+        moved = whole
+        while not moved[2] <= max(past):
             part *= 0.5
             if part <= PARAMETERS.shortest:
-                there = end
+                there, moved = end, whole
                 break
             ends = (at.lam, end.lam), (at.s, end.s), (at.mu, end.mu)
             there = LawPoint(*((1.0 - part) * a + part * b for a, b in ends))
+            moved = program.natural_map(there)
         at = there
     return None, PARAMETERS.max_steps
 
