@@ -62,6 +62,9 @@ class FacetElement:
         return self._element.tabulate(1, np.ascontiguousarray(xi))[1:, :, :, 0]
 
 
+facet_element = cache(FacetElement)  # each is made once
+
+
 # --- Facets of contact surfaces ---------------------------------------------------------------
 
 
@@ -126,9 +129,9 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
     facet = FACET_OF[mesh.topology.cell_type.name]
     geometry = mesh.ufl_domain().ufl_coordinate_element()
     return FacetKind(
-        hats=FacetElement(facet, 1, element.lagrange_variant),
-        displacement=FacetElement(facet, element.degree, element.lagrange_variant),
-        geometry=FacetElement(facet, geometry.degree, geometry.lagrange_variant),
+        hats=facet_element(facet, 1, element.lagrange_variant),
+        displacement=facet_element(facet, element.degree, element.lagrange_variant),
+        geometry=facet_element(facet, geometry.degree, geometry.lagrange_variant),
         axisymmetric=dofs.axisymmetric,
     )
 

@@ -163,7 +163,8 @@ class Traced:
         if failed or dpocon(L, np.abs(A).sum(axis=1).max())[0] < TOLERANCES.invertible:
             return None
         S = sizes[:, None] * dpotri(L, overwrite_c=True)[0] * sizes
-        S += np.triu(S, 1).T
+        S += S.T  # below the diagonal it was 0
+        np.fill_diagonal(S, 0.5 * S.diagonal())
         W = S @ R
         try:
             S -= W @ np.linalg.solve(R.T @ W, W.T)  # in place, as columns lie one after the other
