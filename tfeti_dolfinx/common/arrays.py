@@ -114,9 +114,13 @@ def plus(A: Any, row: Array, column: Array, value: Array) -> Entries:
         data = np.array(A.data)
         data[place] += value
         return Entries(data, A.indices, A.indptr, A.shape)
-    data = np.insert(A.data, place[new], value[new])
-    data[(place + np.cumsum(new))[~new]] += value[~new]
-    indices = np.insert(A.indices, place[new], column[new])
+    place += np.cumsum(new) - new  # among all
+    old = np.ones(len(A.data) + np.sum(new), dtype=bool)
+    old[place[new]] = False
+    data, indices = np.empty(len(old)), np.empty(len(old), dtype=A.indices.dtype)
+    data[old], indices[old] = A.data, A.indices
+    data[place[new]], indices[place[new]] = value[new], column[new]
+    data[place[~new]] += value[~new]
     table = A.indptr + np.searchsorted(row[new], np.arange(A.shape[0] + 1))
     return Entries(data, indices, table, A.shape)
 

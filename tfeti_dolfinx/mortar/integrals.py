@@ -126,7 +126,7 @@ def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:
     right = np.einsum("nvki,nvk->ni", P, r)
     along = np.einsum("nik,ni->nk", vector, right)
     along = np.divide(along, value, out=np.zeros_like(along), where=value > SEARCH.unknown)
-    K = np.einsum("nik,nk,iab->nab", vector, along, unit, optimize=True)
+    K = np.tensordot(np.einsum("nik,nk->ni", vector, along), unit, axes=1)
     return own.swapaxes(1, 2) @ K @ own
 
 
