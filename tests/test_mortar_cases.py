@@ -113,11 +113,12 @@ def test_facets_of_second_order_touch_without_overlap(comm):
     assert np.isclose(*forces, rtol=0.03)
 
 
-def test_edges_are_warned_of(caplog):
+def test_edges_take_normals_of_what_they_meet_and_are_warned_of(caplog):
     parts = [("lower", (0.0, -1.0), (1.0, 0.0), (3, 3)), ("upper", (0.0, 0.0), (1.0, 1.0), (4, 4))]
     d = decomposed_boxes(parts, 4, [("corner", ["upper bottom", "upper right"])])
     bcs = held(d, "lower bottom", "lower left", "upper left")
-    solved(two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")]))
+    p = solved(two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")]))
+    assert np.allclose(p.solution.contact().normal, (0.0, -1.0))  # at the edge, too
     assert ("'corner' has edges" in caplog.text) == (d.comm.rank == 0)
 
 

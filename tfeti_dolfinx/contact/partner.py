@@ -42,7 +42,7 @@ from tfeti_dolfinx.mortar.facets import (
 )
 from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_curvature
 from tfeti_dolfinx.mortar.multipliers import with_held_vertices
-from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
+from tfeti_dolfinx.mortar.segments import find_segments, met_at_edges, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 Gap: TypeAlias = "str | Value"
@@ -364,10 +364,7 @@ LITTLE = (
     "%s: %r covers so little of the facets of the secondary side %r that nodes may lack "
     "conditions; expected secondary=%r"
 )
-EDGES = (
-    "%s: %r has edges; normals are averaged there. Give the sides of an edge names of their own, "
-    "and a pair each"
-)
+EDGES = "%s: %r has edges; one in a corner of the other side needs a pair for each of its own sides"
 
 log = logging.getLogger(__name__)
 
@@ -376,7 +373,7 @@ log = logging.getLogger(__name__)
 class Contact(ContactPartner):
     """Two surfaces may not enter each other.
 
-    Surfaces should be smooth: the sides of an edge are surfaces, and pairs, of their own.
+    Where facets of the secondary side turn by more than 40°, the normal is that of what they meet.
 
     Args:
         a: Name or tag of a surface.
@@ -459,8 +456,7 @@ class Contact(ContactPartner):
             log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
         facets = sides[0].facets
         cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
-        edges = count_over(dofs.comm, cosine < SEARCH.crease)
-        if edges and dofs.comm.rank == 0:
+        if count_over(dofs.comm, cosine < SEARCH.crease) and dofs.comm.rank == 0:
             log.warning(EDGES, self.name, settled.a)
         return settled, found
 
@@ -515,15 +511,18 @@ class Contact(ContactPartner):
         held: Held,
     ) -> ContactRecords:
         """Return conditions from integrals over the first side's facets that face the second."""
-        kind, comm = facet_kind(dofs), dofs.comm
+        kind, comm, across = facet_kind(dofs), dofs.comm, held.across if held else None
         height, deep = SEARCH.seen * reach, SEARCH.seen * depth
         distance = max(height, deep)
         moved, curved = dofs.nodes is not None, self.gap == CURVED
-        facing = with_images(sides[1].facets, dofs, held.across if held else None)
+        facing = with_images(sides[1].facets, dofs, across)
         secondary, primary = rendezvous(sides[0].facets, facing, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
+        own, facets = sides[0], (secondary, primary)
+        normals, secondary = met_at_edges(dofs, own.facets, own.normals, segments, *facets, across)
+        with raised_on_all_ranks(comm):
             integrals = integrate(kind, secondary, primary, segments, moved, curved)
         averted = any_rank(comm, segments.averted)
         if averted and count_over(comm, len(segments.weight)) == 0:
@@ -531,7 +530,7 @@ class Contact(ContactPartner):
                 f"{self.name}: the surfaces are near but face away from each other; expected "
                 "outward normals that oppose each other"
             )
-        found = conditions(dofs, contact, sides[0], integrals, sides[1])
+        found = conditions(dofs, contact, replace(own, normals=normals), integrals, sides[1])
         return self._with_gaps_and_friction(dofs, found, reach, depth)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:

@@ -191,19 +191,26 @@ def _edges(facets: Facets, dofs: TornDofs, across: Array) -> Array:
     edge that begins or ends with an iterate would turn normals, which Newton's method does not
     follow.
     """
+    groups, corners = facets.vertices.ravel(), facets.corners
+    _, averaged = normals_at_rest(facets, dofs)
+    (turned,) = dofs.lookup(groups, np.where(across, 0.0, np.abs(averaged)))
+    most = turned.reshape(corners.shape).max(axis=1, keepdims=True)
+    turned = np.broadcast_to(most, corners.shape).reshape(turned.shape)
+    turned = dofs.reduce_on_owners(groups, turned, np.maximum)
+    return np.abs(averaged) > np.maximum(turned / SEARCH.bends, SEARCH.held)
+
+
+def normals_at_rest(facets: Facets, dofs: TornDofs) -> tuple[Array, Array]:
+    """Return normals of facets as they were meshed, and their means at owned groups. Collective."""
     groups, hats = facets.vertices.ravel(), facet_kind(dofs).hats
     (rest,) = dofs.lookup(groups, dofs.reduce(dofs.points(at_rest=True), np.minimum))
     middle, corners = hats.points.mean(axis=0)[None], facets.corners
     here, there = (
         _normals(hats, x, middle)[0] for x in (corners, rest[:, : dofs.bs].reshape(corners.shape))
     )
-    there *= np.sign(np.sum(here * facets.normal, axis=1, keepdims=True))
-    averaged = unit(dofs.reduce_on_owners(groups, np.repeat(there, corners.shape[1], axis=0)))
-    (turned,) = dofs.lookup(groups, np.where(across, 0.0, np.abs(averaged)))
-    most = turned.reshape(corners.shape).max(axis=1, keepdims=True)
-    turned = np.broadcast_to(most, corners.shape).reshape(turned.shape)
-    turned = dofs.reduce_on_owners(groups, turned, np.maximum)
-    return np.abs(averaged) > np.maximum(turned / SEARCH.bends, SEARCH.held)
+    there = unit(there * np.sign(np.sum(here * facets.normal, axis=1, keepdims=True)))
+    repeated = np.repeat(there, corners.shape[1], axis=0)
+    return there, unit(dofs.reduce_on_owners(groups, repeated))
 
 
 def with_images(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 
 import numpy as np
@@ -10,14 +10,17 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import Exchange
+from tfeti_dolfinx.common.parallel import Exchange, any_rank
 from tfeti_dolfinx.mesh.bisection import bisect_points
+from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.clipping import CommonParts, common_parts, contains, sizes
 from tfeti_dolfinx.mortar.facets import (
     POLYGON,
     FacetKind,
     Facets,
     densities,
+    facet_kind,
+    normals_at_rest,
     points,
     reference_points,
     unit,
@@ -211,6 +214,41 @@ def find_segments(
         whole=covered >= (1.0 - SEARCH.uncovered) * planes.size,
         averted=averted,
     )
+
+
+def met_at_edges(
+    dofs: TornDofs,
+    own: Facets,
+    normals: Array,
+    segments: Segments,
+    secondary: Facets,
+    primary: Facets,
+    across: Array | None,
+) -> tuple[Array, Facets]:
+    """Return normals, and secondary facets, that at edges are those of what these meet. Collective.
+
+    The mean of an edge's faces is no direction in which an edge that slides is stopped. Edges are
+    those at rest of the surface's ``own`` facets on this rank; ``normals`` are of owned groups.
+    Those on planes of symmetry, by flags ``across`` of groups' components, keep theirs.
+    """
+    groups, at = own.vertices, segments.points
+    facet, averaged = normals_at_rest(own, dofs)
+    (averaged,) = dofs.lookup(groups.ravel(), averaged)
+    cosine = np.sum(averaged.reshape(*groups.shape, -1) * facet[:, None], axis=2)
+    edge = dofs.reduce_on_owners(groups.ravel(), cosine.ravel(), np.minimum, 1.0) < SEARCH.edge
+    if across is not None:
+        edge &= ~np.any(across, axis=1)
+    if not any_rank(dofs.comm, edge):
+        return normals, secondary
+    hats = facet_kind(dofs).hats
+    share = segments.weight[:, None] * hats.values(at.xi)
+    faced = -points(hats, primary.vertex_normals[at.primary], at.eta)
+    faced = (share[:, :, None] * faced[:, None]).reshape(-1, dofs.bs)
+    faced = unit(dofs.reduce_on_owners(secondary.vertices[at.secondary].ravel(), faced))
+    edge &= np.any(faced != 0.0, axis=1)
+    normals = np.where(edge[:, None], faced, normals)
+    (turned,) = dofs.lookup(secondary.vertices.ravel(), normals)
+    return normals, replace(secondary, vertex_normals=turned.reshape(secondary.corners.shape))
 
 
 @dataclass(frozen=True)
