@@ -173,7 +173,7 @@ class Tools:
 
     @property
     def load(self) -> Array:
-        """What the unknowns bear: the mean load and 2Mw/τ², w where they would be without it."""
+        """Mean load on the unknowns and 2Mw/τ², w where they would be without any force."""
         if not self.size:
             return self.loads
         mean = 0.5 * (self.loads_at_begin + self.loads)
