@@ -55,17 +55,9 @@ class Thrown:
         if below:
             contacts.append(tfeti.Contact("upper bottom", "lower top", reach=1.0))
         own = {k: keywords.pop(k) for k in ("mass", "stabilised", "lumped") if k in keywords}
-        self.problem = tfeti.ContactDynamics(
-            elastic(u, v, nu=nu),
-            ufl.dot(self.weight, v) * ufl.dx(domain=d.mesh),
-            [],
-            contacts,
-            d,
-            velocity=velocity,
-            u=at,
-            petsc_options={"rtol": 1e-10, **keywords},
-            **{"mass": 1.0, **own},
-        )
+        given = elastic(u, v, nu=nu), ufl.dot(self.weight, v) * ufl.dx(domain=d.mesh), [], contacts
+        own = {"mass": 1.0, **own, "petsc_options": {"rtol": 1e-10, **keywords}}
+        self.problem = tfeti.ContactDynamics(*given, d, velocity=velocity, u=at, **own)
 
     def apply(self, problem, t):
         """Pushed more and more."""

@@ -37,22 +37,14 @@ class Sheared:
         down = fem.Function(W)
         down.interpolate(lambda x: -PRESSED * x[last])
         sides = np.unique(np.concatenate([d.facets(name) for name in ("left", "right", "top")]))
-        bcs = [
-            fem.dirichletbc(
-                down, fem.locate_dofs_topological((V.sub(last), W), fdim, sides), V.sub(last)
-            )
-        ]
+        dofs = fem.locate_dofs_topological((V.sub(last), W), fdim, sides)
+        bcs = [fem.dirichletbc(down, dofs, V.sub(last))]
         for k in range(last):
             bcs.append(roller(V, k, d.facets("top"), self.top if k == 0 else 0.0))
         plane = tfeti.Plane(np.zeros(gdim), np.eye(gdim)[last])
-        self.problem = tfeti.ContactProblem(
-            elastic(u, v, nu=0.0),
-            ufl.ZeroBaseForm((v,)),
-            bcs,
-            [tfeti.Obstacle("bottom", plane, friction=tfeti.Tresca(BOUND))],
-            d,
-            petsc_options={"rtol": 1e-10, **options},
-        )
+        contacts = [tfeti.Obstacle("bottom", plane, friction=tfeti.Tresca(BOUND))]
+        given = elastic(u, v, nu=0.0), ufl.ZeroBaseForm((v,)), bcs, contacts, d
+        self.problem = tfeti.ContactProblem(*given, petsc_options={"rtol": 1e-10, **options})
 
 
 FRICTION = tfeti.Tresca(0.01)

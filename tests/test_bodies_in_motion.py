@@ -25,17 +25,9 @@ def falling(cell, degree, gap, stabilised, weight):
     thrown.interpolate(lambda x: np.stack((0.1 * x[1], -0.3 * x[1] + 0.05 * (x[0] - 0.5))))
     contacts = [tfeti.Obstacle("box 0 bottom", tfeti.Plane((0, 0), (0, 1)), reach=2.0)]
     contacts += [tfeti.Contact(f"box {n} bottom", f"box {n - 1} top", reach=2.0) for n in (1, 2)]
-    return tfeti.ContactDynamics(
-        elastic(u, v),
-        ufl.dot(down, v) * ufl.dx(domain=d.mesh),
-        [],
-        contacts,
-        d,
-        mass=1.0,
-        velocity=thrown,
-        stabilised=stabilised,
-        petsc_options={"rtol": 1e-10},
-    )
+    given = elastic(u, v), ufl.dot(down, v) * ufl.dx(domain=d.mesh), [], contacts, d
+    more = {"stabilised": stabilised, "petsc_options": {"rtol": 1e-10}}
+    return tfeti.ContactDynamics(*given, mass=1.0, velocity=thrown, **more)
 
 
 def rows(problem):

@@ -6,8 +6,8 @@ import ufl
 from bodies import clamped, drawn, held, pressed, sided, stacked, torn_boxes, two_body_problem
 from dolfinx import fem, mesh
 from mpi4py import MPI
-from scenes import apart, bumpy, clamp, decomposed, displacement, forms, problem, roller, vectors
-from test_friction_fields import SCENES, floor, solved
+from scenes import apart, bumpy, decomposed, displacement, forms, problem, solved, vectors
+from test_friction_fields import SCENES, floor, on_a_floor
 from test_nearly_free import rings
 
 import tfeti_dolfinx as tfeti
@@ -16,7 +16,7 @@ import tfeti_dolfinx as tfeti
 @pytest.mark.parametrize(("cell", "traction"), SCENES)
 def test_the_law_holds(cell, traction, comm):
     """Traction at most μ times pressure; slip against it where they are equal, else none."""
-    p, mu = solved(cell, tfeti.Coulomb(0.3), traction), 0.3
+    p, mu = on_a_floor(cell, tfeti.Coulomb(0.3), traction), 0.3
     assert p.report.sticking > 0
     assert p.report.sliding > 0
     data = p.solution.contact()
@@ -50,8 +50,7 @@ def test_a_block_pulled_at_an_angle_slips_at_its_capacity(angle):
     p = problem(d, (*(1.001 * pull), -press), [floor(3, law)], clamped=())
     with pytest.raises(tfeti.NoSolutionError, match=r"would have to be 1\.001 times as large"):
         p.solve()
-    p = problem(d, (*(0.95 * pull), -press), [floor(3, law)], clamped=())
-    p.solve()
+    p = solved(problem(d, (*(0.95 * pull), -press), [floor(3, law)], clamped=()))
     assert p.report.converged_reason == "CONVERGED_RTOL"
 
 
@@ -60,9 +59,8 @@ def test_a_block_that_is_drawn_along_slides_at_its_capacity(comm):
     d, law = decomposed("hexahedron", 3, 2), tfeti.Coulomb(MU, direction=(1, 0, 0))
     V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0, 0.0), d.surface("top"))
     angle, value = 0.3, np.array([5.0 * np.cos(0.3), 5.0 * np.sin(0.3), -0.1])
-    bcs = [clamp(V, d.facets("top"), value)]
-    p = tfeti.ContactProblem(a, L, bcs, [floor(3, law)], d, petsc_options={"rtol": 1e-7})
-    p.solve()
+    bcs = clamped(d, ("top", value))(V)
+    p = solved(tfeti.ContactProblem(a, L, bcs, [floor(3, law)], d, petsc_options={"rtol": 1e-7}))
     assert p.report.sticking == 0
     data = p.solution.contact()
     friction = comm.allreduce((data.area[:, None] * data.tangential_traction).sum(axis=0))[:2]
@@ -80,7 +78,7 @@ def test_a_block_that_is_drawn_by_its_side_rubs_there_too(cell, law, comm):
     d = decomposed(cell, 4, 2)
     gdim, way = d.mesh.geometry.dim, fem.Constant(d.mesh, 0.0)
     V, a, L = forms(d.mesh, d.facet_tags, np.eye(gdim)[-1] * -0.01, d.surface("top"))
-    bcs, options, known = [roller(V, 0, d.facets("left"), way)], {"rtol": 1e-9}, []
+    bcs, options, known = held(d, ("left", way))(V), {"rtol": 1e-9}, []
     p = tfeti.ContactProblem(a, L, bcs, [floor(gdim, law)], d, petsc_options=options)
     for way.value, force in ((0.5, -0.003), (-0.5, 0.003), (-0.5, None)):
         p.solve()
@@ -142,7 +140,7 @@ def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(
     V, u, v = vectors(d)
     push = fem.Constant(d.mesh, (0.0, -0.125))
 
-    def solved(share, problem=None):
+    def pushed_by(share, problem=None):
         push.value[0] = 0.125 * (low + share * (high - low))
         plane = tfeti.Plane((0, 0), normal=(-s, c))
         floor = tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(mu))
@@ -153,8 +151,8 @@ def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(
 
     options, warm = {"rtol": rtol, "friction_type": kind_of}, None
     for share in shares:
-        warm = solved(share, warm)
-        cold = solved(share)
+        warm = pushed_by(share, warm)
+        cold = pushed_by(share)
         assert apart(warm.u.x.array, cold.u.x.array) <= 5.0 * rtol
         cold.destroy()
 
@@ -183,8 +181,7 @@ def test_a_ring_is_turned_in_its_fit_as_far_as_friction_holds(comm):
         return twist * (x * v[1] - y * v[0]) * ds(d.surface("in0"))
 
     fit = tfeti.Contact("out0", "in1", gap=-0.01, friction=tfeti.Coulomb(0.2), name="fit")
-    p = two_body_problem(d, load, clamped(d, "out1"), [fit])
-    p.solve()
+    p = solved(two_body_problem(d, load, clamped(d, "out1"), [fit]))
     fit = p.solution.contact("fit")
     pressed, turned = comm.allreduce(fit.force.sum()), abs(fit.resultant.moment[2])
     twist.value *= 0.97 * 0.2 * np.cos(np.pi / 24) * pressed / turned
@@ -202,8 +199,7 @@ def test_what_sticks_where_a_wall_pushes_slips():
     """Sticking to the floor contradicts a wall that overlaps it by 0.01: bounds hold neither."""
     d, law = decomposed("quadrilateral", 4, 3), tfeti.Coulomb(0.3)
     wall = tfeti.Obstacle("left", tfeti.Plane((0.01, 0), (1, 0)), friction=law)
-    p = problem(d, (0.0, -0.05), [floor(2, law), wall], clamped=(), rtol=1e-8)
-    p.solve()
+    p = solved(problem(d, (0.0, -0.05), [floor(2, law), wall], clamped=(), rtol=1e-8))
     x, u = displacement(p)
     assert u[np.isclose(x[:, 0], 0.0), 0].min() >= 0.01 - 1e-9
     for one in map(p.solution.contact, (0, 1)):
@@ -217,7 +213,6 @@ def test_a_block_that_falls_onto_waves_is_held(weight, side):
     d = torn_boxes("quadrilateral", [("a", (0.0, 0.0), (1.0, 0.7), (6, 3))], 2)
     contacts = [tfeti.Obstacle("a bottom", bumpy(0.004, 0.006), friction=tfeti.Coulomb(0.5))]
     force = fem.Constant(d.mesh, (weight * side, -weight))
-    p = two_body_problem(d, drawn(d, None, force), clamped(d), contacts)
-    p.solve()
+    p = solved(two_body_problem(d, drawn(d, None, force), clamped(d), contacts))
     found = p.solution.contact().resultant.force[:2]
     assert np.allclose(found, -0.7 * np.asarray(force.value), rtol=1e-6, atol=0.0)

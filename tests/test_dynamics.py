@@ -276,16 +276,10 @@ class Driven:
     def __init__(self, d, sides, contact):
         V, u, v = vectors(d)
         self.place, up = fem.Constant(d.mesh, 0.0), d.mesh.geometry.dim - 1
-        self.problem = tfeti.ContactDynamics(
-            elastic(u, v),
-            ufl.ZeroBaseForm((v,)),
-            [roller(V, up, d.facets(side), self.place) for side in sides],
-            [contact],
-            d,
-            mass=1.0,
-            stabilised=True,
-            petsc_options={"rtol": RTOL},
-        )
+        bcs = [roller(V, up, d.facets(side), self.place) for side in sides]
+        given = elastic(u, v), ufl.ZeroBaseForm((v,)), bcs, [contact], d
+        more = {"mass": 1.0, "stabilised": True, "petsc_options": {"rtol": RTOL}}
+        self.problem = tfeti.ContactDynamics(*given, **more)
 
     def step(self, size, place):
         """Go on to where supports have a place; the report."""
@@ -361,17 +355,10 @@ class Stretched:
         self.data = {"E": fem.Constant(d.mesh, 1.0), "density": fem.Constant(d.mesh, 1.0)}
         begin = fem.Function(V)
         begin.interpolate(lambda x: np.stack((0.1 * x[0] ** 2, 0.2 * x[1])))
-        self.problem = tfeti.ContactDynamics(
-            self.data["E"] * elastic(u, v),
-            ufl.ZeroBaseForm((v,)),
-            [],
-            [tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))],
-            d,
-            mass=self.data["density"],
-            stabilised=stabilised,
-            u=begin,
-            petsc_options={"rtol": TIGHT},
-        )
+        floor = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))]
+        given = self.data["E"] * elastic(u, v), ufl.ZeroBaseForm((v,)), [], floor, d
+        more = {"stabilised": stabilised, "u": begin, "petsc_options": {"rtol": TIGHT}}
+        self.problem = tfeti.ContactDynamics(*given, mass=self.data["density"], **more)
 
     def solve(self, step, data):
         """Of a step from the begin: displacements and velocities of this rank."""

@@ -25,17 +25,10 @@ def compressed(d, elastic, degree=1, contacts=(), on="top", sides=("left", "bott
     gdim = d.mesh.geometry.dim
     V, u, v = vectors(d, degree)
     ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    problem = tfeti.ContactProblem(
-        elastic.a(u, v),
-        -fem.Constant(d.mesh, PRESSURE) * elastic.thickness * v[gdim - 1] * ds(d.surface(on)),
-        held(d, *sides)(V),
-        list(contacts),
-        d,
-        stress=elastic.stress,
-        thickness=elastic.thickness,
-        petsc_options={**TO_ROUNDING, **options},
-    )
-    return solved(problem)
+    L = -fem.Constant(d.mesh, PRESSURE) * elastic.thickness * v[gdim - 1] * ds(d.surface(on))
+    given = elastic.a(u, v), L, held(d, *sides)(V), list(contacts), d
+    more = {"thickness": elastic.thickness, "petsc_options": {**TO_ROUNDING, **options}}
+    return solved(tfeti.ContactProblem(*given, stress=elastic.stress, **more))
 
 
 def uniaxial(model, x, nu=POISSON):

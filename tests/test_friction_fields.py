@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from dolfinx import fem
-from scenes import decomposed, displacement, largest, problem
+from scenes import decomposed, displacement, largest, problem, solved
 from test_tresca import nodal_data
 
 import tfeti_dolfinx as tfeti
@@ -17,12 +17,10 @@ def floor(gdim, law, reach=np.inf):
     return tfeti.Obstacle("bottom", tfeti.Plane(0.0 * up, up), friction=law, reach=reach)
 
 
-def solved(cell, law, traction, n=4, subdomains=4, **options):
+def on_a_floor(cell, law, traction, n=4, subdomains=4, **options):
     d = decomposed(cell, n, subdomains)
     gdim = d.mesh.geometry.dim
-    p = problem(d, traction, [floor(gdim, law)], **{**EXACT, **options})
-    p.solve()
-    return p
+    return solved(problem(d, traction, [floor(gdim, law)], **{**EXACT, **options}))
 
 
 SCENES = [("quadrilateral", (0.05, -0.05)), ("tetrahedron", (0.01, -0.035, -0.05))]
@@ -31,7 +29,7 @@ SCENES = [("quadrilateral", (0.05, -0.05)), ("tetrahedron", (0.01, -0.035, -0.05
 @pytest.mark.parametrize("law", [tfeti.Tresca(0.0), tfeti.Coulomb(0.0)])
 def test_a_bound_of_0_is_no_friction(law):
     (cell, traction), _ = SCENES
-    without, with_none = solved(cell, None, traction), solved(cell, law, traction)
+    without, with_none = (on_a_floor(cell, one, traction) for one in (None, law))
     assert np.allclose(displacement(with_none)[1], displacement(without)[1], rtol=0, atol=1e-9)
     assert with_none.report.sticking == with_none.report.sliding == 0
     assert with_none.report.active_contacts == without.report.active_contacts > 0
@@ -42,7 +40,7 @@ def test_a_bound_of_0_is_no_friction(law):
 @pytest.mark.parametrize("law", [tfeti.Tresca(1e3), tfeti.Coulomb(1e3)])
 def test_a_large_bound_sticks(law, comm):
     cell, traction = SCENES[1]
-    p = solved(cell, law, traction)
+    p = on_a_floor(cell, law, traction)
     assert p.report.sliding == 0
     assert p.report.sticking == p.report.active_contacts > 0
     _, _, status, slip = nodal_data(p.solution, comm)
@@ -53,7 +51,7 @@ def test_a_large_bound_sticks(law, comm):
 @pytest.mark.parametrize(("cell", "traction"), SCENES)
 def test_where_all_slides_friction_is_its_bound_times_the_area(cell, traction, comm):
     bound = 1e-4
-    p = solved(cell, tfeti.Tresca(bound), traction)
+    p = on_a_floor(cell, tfeti.Tresca(bound), traction)
     data = p.solution.contact()
     size = np.linalg.norm(data.tangential_traction, axis=1)
     assert np.all(size <= bound * (1 + 1e-9))
@@ -70,12 +68,12 @@ def test_where_all_slides_friction_is_its_bound_times_the_area(cell, traction, c
 
 
 def test_fields_of_friction_are_written():
-    rough = solved("quadrilateral", tfeti.Tresca(0.01), (0.05, -0.05))
+    rough = on_a_floor("quadrilateral", tfeti.Tresca(0.01), (0.05, -0.05))
     names = [field.name for field in nodal_fields(rough.solution)]
     assert {"tangential_traction", "slip", "status"} <= set(names)
     traction = rough.solution.tangential_traction.x.array.reshape(-1, 2)
     assert largest(traction) == pytest.approx(0.01)
-    smooth = solved("quadrilateral", None, (0.05, -0.05))
+    smooth = on_a_floor("quadrilateral", None, (0.05, -0.05))
     names = [field.name for field in nodal_fields(smooth.solution)]
     assert not {"tangential_traction", "slip"} & set(names)
 
@@ -85,8 +83,7 @@ def test_a_bound_may_change_between_solves():
     d = decomposed("quadrilateral", 5, 4)
     bound = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 1)))
     bound.x.array[:] = 0.01
-    p = problem(d, (0.05, -0.05), [floor(2, tfeti.Tresca(bound))], **EXACT)
-    p.solve()
+    p = solved(problem(d, (0.05, -0.05), [floor(2, tfeti.Tresca(bound))], **EXACT))
     first = displacement(p)[1]
     bound.x.array[:] = 0.004
     p.solve()
@@ -94,8 +91,7 @@ def test_a_bound_may_change_between_solves():
     assert "friction" not in p.report.reused
     assert np.abs(displacement(p)[1] - first).max() > 1e-4
     for value in (0.0, 0.004):  # a bound of 0 has no rows
-        fresh = problem(d, (0.05, -0.05), [floor(2, tfeti.Tresca(value))], **EXACT)
-        fresh.solve()
+        fresh = solved(problem(d, (0.05, -0.05), [floor(2, tfeti.Tresca(value))], **EXACT))
         bound.x.array[:] = value
         p.solve()
         assert np.allclose(displacement(p)[1], displacement(fresh)[1], rtol=0, atol=1e-8)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import decomposed, displacement, problem
-from test_friction_fields import floor, solved
+from test_friction_fields import floor, on_a_floor
 from test_mpgp import as_set
 from test_qp import matrix, vector
 
@@ -79,8 +79,8 @@ def test_it_solves_the_law(seed, k, r):
 def test_it_finds_what_the_fixed_point_finds(options):
     """With any solver and preconditioner."""
     scene = "quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05)
-    p = solved(*scene, friction_type="newton", **options)
-    fixed_point = solved(*scene, friction_type="fixed_point")
+    p = on_a_floor(*scene, friction_type="newton", **options)
+    fixed_point = on_a_floor(*scene, friction_type="fixed_point")
     u, expected = displacement(p)[1], displacement(fixed_point)[1]
     assert p.report.friction_newton_steps > 0 == fixed_point.report.friction_newton_steps
     assert p.report.converged_reason == "CONVERGED_RTOL"
@@ -103,7 +103,7 @@ def test_laws_of_both_kinds_in_one_scene():
 
 
 def test_the_same_load_again_takes_no_step():
-    p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05), rtol=1e-6)
+    p = on_a_floor("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05), rtol=1e-6)
     assert p.report.friction_newton_steps > 0
     p.solve()
     assert p.report.friction_newton_steps == 0

@@ -9,7 +9,7 @@ from dolfinx import mesh as dmesh
 from moving import Thrown
 from mpi4py import MPI
 from reference.nonlinear import block, by_dolfinx, nearest_nodes
-from scenes import accepted, decomposed, elastic, largest, unknowns
+from scenes import accepted, apart, decomposed, elastic, largest, unknowns, vectors
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress.laws import neo_hooke
@@ -246,6 +246,33 @@ def test_a_step_that_is_given_up_leaves_no_trace(comm):
     for _ in range(2):
         accepted(other)
     assert largest(problem.u.x.array - other.u.x.array) <= 1e-8
+
+
+@pytest.mark.parametrize("kind", ["linear", "stabilised", "finite"])
+def test_a_hammer_and_a_block_have_one_momentum(kind, shared_tmp):
+    """They fly after a slanted blow with friction; a run goes on from its checkpoint."""
+    found, path, times = [], shared_tmp / "hammer", 0.01 * np.arange(1, 21)
+    shape = {"point": (0.7, 1.2), "free": ("x", "y", "rz"), "velocity": (0.3, -2.0)}
+    plate = tfeti.Plane((0.5, 1.01), normal=(0.02, -1.0))
+    hammer = tfeti.RigidBody(plate, **shape, mass=0.5, inertia=0.02, force=(0.0, -0.2))
+    contacts = [tfeti.Obstacle("top", hammer, friction=tfeti.Coulomb(0.3), reach=1.0)]
+    given = {"stabilised": kind != "linear", "petsc_options": {"rtol": 1e-9}}
+    for last in (20, 9, 20):
+        d = decomposed("triangle", 4, 4)
+        problem, kept = flying(d, lambda x: 0.0 * x[:2], contacts, **given)
+        if kind != "finite":
+            _, u, v = vectors(d)
+            forms = elastic(u, v), ufl.ZeroBaseForm((v,))
+            problem = tfeti.ContactDynamics(*forms, [], contacts, d, mass=RHO, **given)
+        steps = tfeti.LoadSteps(problem, lambda *_: None, times[:last], checkpoint=path)
+        records = steps.run(resume=last == 20 and len(found) > 0)
+        found.append(problem.u.x.array)
+        tool, motion = problem.solution.tool(0), [record.motion for record in records]
+        assert max(abs(one["defect"]) for one in motion) < 1e-9
+        assert sum(one["friction"] for one in motion) <= 0.0 < np.abs(tool.spin[2])
+        both = 0.5 * tool.velocity + kept(problem.solution.velocity)[:2]
+        assert np.allclose(both, (0.15, -1.0 - 0.2 * times[last - 1]), rtol=0.0, atol=1e-11)
+    assert apart(found[2], found[0]) < 1e-8
 
 
 def test_mistakes_are_named(comm):

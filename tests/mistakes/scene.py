@@ -7,7 +7,7 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import box, hooke, strain
+from scenes import box, hooke, solved, strain
 
 import tfeti_dolfinx as tfeti
 
@@ -164,23 +164,17 @@ class Scene:
     @cached_property
     def solved(self):
         """A solution with a contact and a stress."""
-        problem = self.problem(contacts=[self.floor], stress=hooke())
-        problem.solve()
-        return problem.solution
+        return solved(self.problem(contacts=[self.floor], stress=hooke())).solution
 
     @cached_property
     def twice(self):
         """A solution with two contacts of one name."""
-        problem = self.problem(contacts=[self.floor, self.floor])
-        problem.solve()
-        return problem.solution
+        return solved(self.problem(contacts=[self.floor, self.floor])).solution
 
     @cached_property
     def bare(self):
         """A solution without contacts and stress."""
-        problem = self.problem()
-        problem.solve()
-        return problem.solution
+        return solved(self.problem()).solution
 
 
 def raising(*_):
