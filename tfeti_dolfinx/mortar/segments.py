@@ -234,7 +234,7 @@ def met_at_edges(
     groups, at = own.vertices, segments.points
     facet, averaged = normals_at_rest(own, dofs)
     (averaged,) = dofs.lookup(groups.ravel(), averaged)
-    cosine = np.sum(averaged.reshape(*groups.shape, -1) * facet[:, None], axis=2)
+    cosine = np.sum(averaged.reshape(*groups.shape, dofs.bs) * facet[:, None], axis=2)
     edge = dofs.reduce_on_owners(groups.ravel(), cosine.ravel(), np.minimum, 1.0) < SEARCH.edge
     if across is not None:
         edge &= ~np.any(across, axis=1)
