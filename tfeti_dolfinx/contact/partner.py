@@ -521,7 +521,9 @@ class Contact(ContactPartner):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
         own, facets = sides[0], (secondary, primary)
-        normals, secondary = met_at_edges(dofs, own.facets, own.normals, segments, *facets, across)
+        normals, secondary, segments = met_at_edges(
+            dofs, own.facets, own.normals, segments, *facets, across
+        )
         with raised_on_all_ranks(comm):
             integrals = integrate(kind, secondary, primary, segments, moved, curved)
         averted = any_rank(comm, segments.averted)

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, quotient
 from tfeti_dolfinx.common.parallel import Exchange, any_rank
 from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -224,12 +224,13 @@ def met_at_edges(
     secondary: Facets,
     primary: Facets,
     across: Array | None,
-) -> tuple[Array, Facets]:
-    """Return normals, and secondary facets, that at edges are those of what these meet. Collective.
+) -> tuple[Array, Facets, Segments]:
+    """Return normals, secondary facets and segments whose edges face what they meet. Collective.
 
-    The mean of an edge's faces is no direction in which an edge that slides is stopped. Edges are
-    those at rest of the surface's ``own`` facets on this rank; ``normals`` are of owned groups.
-    Those on planes of symmetry, by flags ``across`` of groups' components, keep theirs.
+    The mean of an edge's faces is no direction in which an edge that slides is stopped, and a side
+    that stands on what the edge meets does not bear. Edges are those at rest of the surface's
+    ``own`` facets on this rank; ``normals`` are of owned groups. Those on planes of symmetry, by
+    flags ``across`` of groups' components, keep theirs.
     """
     groups, at = own.vertices, segments.points
     facet, averaged = normals_at_rest(own, dofs)
@@ -239,16 +240,24 @@ def met_at_edges(
     if across is not None:
         edge &= ~np.any(across, axis=1)
     if not any_rank(dofs.comm, edge):
-        return normals, secondary
-    hats = facet_kind(dofs).hats
+        return normals, secondary, segments
+    # 1. facets beside an edge count as they face what they meet, over the one that does so most
+    hats, vertices, s = facet_kind(dofs).hats, secondary.vertices, at.secondary
+    cosine = np.sum(secondary.normal[s] * primary.normal[at.primary], axis=1)
+    cosine = np.repeat(np.maximum(-cosine, 0.0)[:, None], hats.size, axis=1)
+    most = dofs.reduce_on_owners(vertices[s].ravel(), cosine.ravel(), np.maximum)
+    most, sharp = (x.reshape(vertices.shape)[s] for x in dofs.lookup(vertices.ravel(), most, edge))
+    counts = np.where(sharp, quotient(cosine, most), 1.0).min(axis=1) ** SEARCH.aside
+    segments = replace(segments, weight=segments.weight * counts)
+    # 2. the mean of what an edge meets is its normal
     share = segments.weight[:, None] * hats.values(at.xi)
     faced = -points(hats, primary.vertex_normals[at.primary], at.eta)
     faced = (share[:, :, None] * faced[:, None]).reshape(-1, dofs.bs)
-    faced = unit(dofs.reduce_on_owners(secondary.vertices[at.secondary].ravel(), faced))
-    edge &= np.any(faced != 0.0, axis=1)
-    normals = np.where(edge[:, None], faced, normals)
-    (turned,) = dofs.lookup(secondary.vertices.ravel(), normals)
-    return normals, replace(secondary, vertex_normals=turned.reshape(secondary.corners.shape))
+    faced = unit(dofs.reduce_on_owners(vertices[s].ravel(), faced))
+    normals = np.where(edge[:, None] & np.any(faced != 0.0, axis=1, keepdims=True), faced, normals)
+    (turned,) = dofs.lookup(vertices.ravel(), normals)
+    turned = turned.reshape(secondary.corners.shape)
+    return normals, replace(secondary, vertex_normals=turned), segments
 
 
 @dataclass(frozen=True)

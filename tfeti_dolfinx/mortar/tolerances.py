@@ -13,6 +13,9 @@ class SearchTolerances:
     # cosine of 20°: facets that turn by twice that at a vertex have an edge there, others are those
     # of a smooth surface, with nine facets or more around a pin
     edge: float = 0.94
+    # power of the cosine by which facets beside an edge count: a side that bulges towards what the
+    # edge meets by 10° counts a thousandth, by 30° a sixteenth
+    aside: float = 4.0
     # how much farther a normal is turned beside a plane of symmetry than on it, where the surface
     # bends towards it: twice on an arc of equal facets, 1 on a plane that meets it at a slant
     bends: float = 1.2
