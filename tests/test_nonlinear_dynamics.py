@@ -267,6 +267,7 @@ def test_a_hammer_and_a_block_have_one_momentum(kind, shared_tmp):
         steps = tfeti.LoadSteps(problem, lambda *_: None, times[:last], checkpoint=path)
         records = steps.run(resume=last == 20 and len(found) > 0)
         found.append(problem.u.x.array)
+        problem.restore(problem.state())
         tool, motion = problem.solution.tool(0), [record.motion for record in records]
         assert max(abs(one["defect"]) for one in motion) < 1e-9
         assert sum(one["friction"] for one in motion) <= 0.0 < np.abs(tool.spin[2])

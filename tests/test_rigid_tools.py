@@ -274,12 +274,14 @@ def test_a_tool_that_hits_is_a_body_that_falls():
         law = (lambda t: (0.0, -speed * t)) if moves == "tool" else (0.0, 0.0)
         heavy = {"mass": 1e12, "velocity": (0, -speed), "free": ("y",)} if moves == "hammer" else {}
         tool = tfeti.RigidBody(top(2, 1.05), displacement=law, **heavy)
-        given = {"mass": 1.0, "velocity": begin, "petsc_options": TIGHT}
-        problem = tfeti.ContactDynamics(**scene, contacts=[tfeti.Obstacle("top", tool)], **given)
+        given = {"mass": 1.0, "velocity": begin, "stabilised": True, "petsc_options": TIGHT}
+        given["contacts"] = [tfeti.Obstacle("top", tool, reach=0.01)]
+        problem = tfeti.ContactDynamics(**scene, **given)
         records = tfeti.LoadSteps(problem, lambda problem, t: None, np.linspace(0.1, 1.0, 10)).run()
         assert max(abs(r.tools["tool of surface 'top' force y"]) for r in records) > 0.0
         shift = 0.0 if moves == "body" else speed * 1.0
-        found.append(problem.u.x.array.reshape(-1, 2) + (0.0, shift))
+        forces = [record.contact_forces[0] for record in records]
+        found.append(np.vstack((problem.u.x.array.reshape(-1, 2) + (0.0, shift), forces)))
     assert all(np.abs(x - found[1]).max(initial=0.0) <= 1e-9 for x in found)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -182,6 +183,14 @@ class Tools:
     def set_out(self, size: float) -> None:
         """Begin a time step with the present velocity."""
         self.size, self.start, self.drift = size, self.speed, size * self.speed
+
+    @contextmanager
+    def adrift(self) -> Iterator[None]:
+        """Have the free motions where they drift to, for a while."""
+        known, self.found = self.found, 0.0 * self.found
+        self.found[self.tool, self.mode] = self.basis @ (self.at_begin() + self.drift)
+        yield
+        self.found = known
 
     def of_mass_alone(self) -> Tools:
         """Return the same bodies with M for a stiffness, and Mw for a load."""

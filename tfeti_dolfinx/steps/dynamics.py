@@ -172,7 +172,7 @@ class Predictor:
             else:
                 if self._dual is not None:
                     self._dual.destroy()
-                    self._subdomains.retrace(constraints.trace)
+                self._subdomains.retrace(constraints.trace)
                 self._dual, self._options = settings.make_dual(
                     constraints,
                     self._subdomains,
@@ -328,7 +328,9 @@ class ContactDynamics(ContactProblem):
         system.tools.set_out(motion.size)
         if self._predictor is not None:  # what contact allows the bodies without elasticity
             system.make_up_to("right side", self._seconds)
-            if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
+            with system.tools.adrift():
+                overlap = system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0)
+            if overlap:
                 system.change("constraints")
                 system.make_up_to("right side", self._seconds)
             motion.towards = self._predictor.nearest(free, inertia.M, system.gluing, system.tools)
@@ -391,6 +393,7 @@ class ContactDynamics(ContactProblem):
         tools = self._system.tools
         tools.speed, tools.loads_at_begin = state.tool_speed, state.tool_loads
         tools.set_out(inertia.motion.size)
+        tools.drift = 0.0 * tools.speed  # at the end of a step: so fast it has been there
         super()._take_motion(state)
 
     def destroy(self) -> None:
