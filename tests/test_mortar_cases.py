@@ -114,7 +114,7 @@ def test_facets_of_second_order_touch_without_overlap(comm):
 
 
 def test_edges_take_normals_of_what_they_meet_and_are_warned_of(caplog):
-    parts = [("lower", (0.0, -1.0), (1.0, 0.0), (3, 3)), ("upper", (0.0, 0.0), (1.0, 1.0), (4, 4))]
+    parts = [("lower", (0.0, -1.0), (1.5, 0.0), (3, 3)), ("upper", (0.0, 0.0), (1.0, 1.0), (4, 4))]
     d = decomposed_boxes(parts, 4, [("corner", ["upper bottom", "upper right"])])
     bcs = held(d, "lower bottom", "lower left", "upper left")
     p = solved(two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")]))
