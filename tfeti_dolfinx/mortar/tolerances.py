@@ -11,7 +11,7 @@ class SearchTolerances:
 
     sliver: float = 1e-12  # common parts below it are what rounding leaves where facets touch
     # cosine of 20°: facets that turn by twice that at a vertex have an edge there, others are those
-    # of a smooth surface, with nine facets or more around a pin
+    # of a smooth surface, with ten facets or more around a pin
     edge: float = 0.94
     # power of the cosine by which facets beside an edge count: a side that bulges towards what the
     # edge meets by 10° counts a thousandth, by 30° a sixteenth
