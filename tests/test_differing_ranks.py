@@ -246,7 +246,7 @@ CASES = {
         rf"tolerances: max_it is 9{ON}8 on rank 0",
     ),
     "a load of a nonlinear problem on one": (nonlinear(load_on_one=True), "load and stiffness are"),
-    "a free rigid body on one": (free_body_on_one, "a RigidBody with free motions in a Contact"),
+    "a free rigid body on one": (free_body_on_one, rf"shape: free is 1{ON}0 on rank 0"),
     "an update that raises on one": (nonlinear(update=lambda: 1 / (not ODD)), "update: ZeroDiv"),
     "a law of another value on one": (
         contacts(*[[floor(displacement=lambda t: (0.0, 0.02 if ODD else 0.01))]] * 2),
