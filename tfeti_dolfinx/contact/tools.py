@@ -189,8 +189,10 @@ class Tools:
         """Have the free motions where they drift to, for a while."""
         known, self.found = self.found, 0.0 * self.found
         self.found[self.tool, self.mode] = self.basis @ (self.at_begin() + self.drift)
-        yield
-        self.found = known
+        try:
+            yield
+        finally:
+            self.found = known
 
     def of_mass_alone(self) -> Tools:
         """Return the same bodies with M for a stiffness, and Mw for a load."""
