@@ -500,7 +500,7 @@ class ContactProblem:
         assert self._accepted is not None
         solution, start = self._accepted
         (reach, _), dual = self._system.search.rows(), self._system.dual
-        state = SavedState.of(solution, start[2], dual.seen, reach)
+        state = SavedState.of(solution, start[2], dual, reach)
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
         if dual.constraints is not start[0].constraints:
             return state
@@ -533,7 +533,7 @@ class ContactProblem:
         system.look_for_changes()
         system.tools.go_back(state.tools)  # by now laws may have others
         dual = system.make(self._seconds)
-        dual.seen = max(dual.seen, float(state.norm))
+        dual.seen, dual.left = max(dual.seen, float(state.norm)), tuple(state.left)
         state = state.on_rows(system.gluing)
         # what conditions prescribed then: by now they may have other values
         values = self.dofs.reduce(state.u.reshape(-1, self.dofs.bs), np.maximum)

@@ -14,6 +14,7 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.sets import Status
@@ -143,6 +144,7 @@ class SavedState:
     lam: Array  # multipliers λ of this rank's rows
     mu: Array  # multipliers of Gλ = e; empty where they are not known
     norm: Array  # estimate of ‖F‖ that solves have come to, shape ()
+    left: Array  # what solves with Coulomb's law leave of residuals, shape (2,), see `Dual.left`
     status: Array  # status of each row, see `qp.sets.Status`
     slip: Array  # where the load step began: tangential v_i of the conditions, (n, gdim - 1)
     reach: Array  # how far was searched in each contact
@@ -176,7 +178,7 @@ class SavedState:
     freezes: Array = field(default_factory=lambda: np.ones(()))
 
     @classmethod
-    def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
+    def of(cls, solution: Solution, mu: Array, dual: Dual, reach: list[float]) -> SavedState:
         """Return the state of a solution."""
         gluing, holding = solution.gluing, solution.holding
         records, dofs = gluing.records, solution.dofs
@@ -193,7 +195,8 @@ class SavedState:
             u=solution.u,
             lam=solution.lam,
             mu=mu,
-            norm=np.array(norm),
+            norm=np.array(dual.seen),
+            left=np.array(dual.left),
             status=np.where(solution.carrying, bearing, Status.OPEN),
             slip=gluing.slip,
             reach=np.array(reach, dtype=float),
@@ -288,6 +291,7 @@ class SavedState:
             "secondary": self.secondary.tolist(),
             "size": float(self.size),
             "norm": float(self.norm),
+            "left": self.left.tolist(),
             "freezes": bool(self.freezes),
             "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
             "number of directions": self.directions.shape[2],

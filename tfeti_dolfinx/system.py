@@ -104,6 +104,7 @@ class System(Generic[OwnForms]):
         self.how, self._counted = settings.inverses(), 0
         self._equals = EqualSubdomains(self.how)
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
+        self._left = 0.0, 0.0  # as `Dual` has it
         self.inverses, self.follows = 0, False
         self.weights: Array | None = None
         self._K: Any = None
@@ -421,7 +422,7 @@ class System(Generic[OwnForms]):
         self._dual = self._settings.make_dual(
             self.gluing.constraints, self.subdomains, self._dofs, law, names
         )
-        self.dual.seen = max(self.dual.seen, self._seen)
+        self.dual.seen, self.dual.left = max(self.dual.seen, self._seen), self._left
         self._equals.kept.clear()
 
     def _slip(self) -> tuple[Array, Array]:
@@ -449,7 +450,7 @@ class System(Generic[OwnForms]):
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:
-            self._seen = self.dual.seen
+            self._seen, self._left = self.dual.seen, self.dual.left
             self.dual.destroy()
         self._dual = None
 

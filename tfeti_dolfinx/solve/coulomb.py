@@ -30,6 +30,8 @@ class CoulombParameters:
     first: float = 1e-2  # relative tolerance of the first problem with given bounds
     # of the last change of bounds: that of the next one. Forces are less exact than displacements
     share: float = 0.01
+    # of rtol times its first residual: no residual that earlier solves let expect is less
+    expected: float = 0.01
     near: float = 10.0  # of what is wanted: a change from which on the next one may be small enough
     # times rtol: change of bounds at rest, where options ask for no less
     beside_rtol: float = 100.0
@@ -52,6 +54,7 @@ class CoulombParameters:
     light: float = 1e-6
     reach: float = 10.0  # ρ of the natural map at points that are made to slip
     rounding: float = 2e-16  # of ‖F‖‖λ‖, or of ‖d‖: no residual is less
+    seen: float = 1e3  # times that: a residual that is expected is not less
     # of what bends, of gaps and of what is prescribed: a slip without end. It is below 10 where
     # friction holds, below 1e3 where it holds 1e-6 more than the load, 1e4 and more where it fails
     slips: float = 1e4
@@ -150,6 +153,7 @@ def solve_with_friction(
         if motion is not None or restless:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
+    newton.learn(result, rule)
     result.steps = steps
     slides = _slides(dual, result, rule, motion)
     at_rest = change, tolerance, bounds.body
@@ -349,12 +353,19 @@ class NewtonOnLaw:
     def __init__(self, dual: Dual, options: Options, rtol: float) -> None:
         self._dual, self._rtol = dual, rtol
         self.tries = PARAMETERS.tries if options.friction_type == "newton" else 0
-        self.steps, self._share = 0, 1.0
+        self.steps, self._share, self._first = 0, 1.0, 0.0
         self._recycled = dual.recycled
         self._before: Array = np.zeros(0)  # bounds before those of the last answer
         pairs = zip(dual.solved, (dual.d, dual.coarse.e), strict=True)
         other = not all(np.array_equal(kept, now) for kept, now in pairs)
         self._rests = not any_rank(dual.coarse.comm, other)
+
+    def learn(self, result: QPResult, rule: Accuracy) -> None:
+        """Keep for the next solve what residual is little enough, over that of the start."""
+        if self._first > 0.0 and result.reason > 0:
+            enough = result.projected_gradient / max(rule.ratio(), PARAMETERS.finer)
+            left = PARAMETERS.looser * enough / self._first
+            self._dual.left = self._rtol, float(steering(self._dual.coarse.comm, left)[0])
 
     def go_on(
         self, law: tuple[Array, Array], bounds: FrictionBounds, aim: float, looked: bool
@@ -410,12 +421,17 @@ class NewtonOnLaw:
         residuals = [program.natural_map(point)[2] for point in points]
         residual = min(residuals)
         first = points[residuals.index(residual)]
-        # Step 2: the target
+        # Step 2: the target; the first also by what the last solve to rtol has left of its own
         size = norm_over(qp.coarse.comm, qp.coarse.project(qp.d))
         target = min(self._share * self._rtol * size, PARAMETERS.finer * residual, aim)
+        terms = max(norm * norm_over(dual.coarse.comm, start[0]), norm_over(dual.coarse.comm, qp.d))
+        if self._first == 0.0:
+            self._first, (rtol, left) = residual, dual.left
+            expected = max(left, PARAMETERS.expected * rtol) * residual
+            if rtol == self._rtol and expected > PARAMETERS.seen * PARAMETERS.rounding * terms:
+                target = min(target, expected)
         # Step 3: Newton's method
         end, steps = None, 0
-        terms = max(norm * norm_over(dual.coarse.comm, start[0]), norm_over(dual.coarse.comm, qp.d))
         if target > PARAMETERS.rounding * terms:
             end, steps = newton_on_law(program, first, target)
         self.steps, self._share = self.steps + steps, PARAMETERS.finer * self._share
