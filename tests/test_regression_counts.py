@@ -26,3 +26,8 @@ def test_multiplications_of_a_demo(name, quick_demo):
     found = multiplications(quick_demo(name).report)
     apart = abs(found - expected) if SAME_MESH else found - expected
     assert apart <= max(SHARE * expected, FEW), f"{found}, expected {expected}"
+
+
+def test_a_load_step_with_friction_looks_once(quick_demo):
+    """What the step before has left of its residual tells how exact Coulomb's law has to be."""
+    assert quick_demo("bolted_joint_3d").report["recoveries"] == 1
