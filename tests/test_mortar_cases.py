@@ -18,7 +18,7 @@ from bodies import (
 )
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, decomposed, problem, solved
+from scenes import clamp, decomposed, problem, roller, solved
 
 import tfeti_dolfinx as tfeti
 from meshes.cylinder_on_block import build
@@ -120,6 +120,29 @@ def test_edges_take_normals_of_what_they_meet_and_are_warned_of(caplog):
     p = solved(two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")]))
     assert np.allclose(p.solution.contact().normal, (0.0, -1.0))  # at the edge, too
     assert ("'corner' has edges" in caplog.text) == (d.comm.rank == 0)
+
+
+@pytest.mark.parametrize("order", [("lower", "upper"), ("upper", "lower")])
+@pytest.mark.parametrize("degree", [1, 2])
+def test_whole_boundaries_press_as_their_faces_alone(order, degree):
+    """Of a quarter of two cubes on a plane, apart at first, cuts and sides bear nothing."""
+    low, high = ((0.0, 0.0, -1.0), (1.0, 1.0, 0.0)), ((0.0, 0.0, 0.05), (1.0, 1.0, 1.0))
+    parts = [("lower", *low, (2, 2, 2)), ("upper", *high, (3, 3, 2))]
+    ends = [("lower", "top"), ("lower", "bottom"), ("upper", "bottom")]
+    around = [(body, side) for body in order for side in ("left", "right", "front", "back")]
+    skins = [(body, [f"{a} {side}" for a, side in ends + around if a == body]) for body in order]
+    d = decomposed_boxes(parts, 4, skins, "hexahedron")
+    cuts = [d.locate_facets(lambda x, k=k: np.isclose(x[k], 0.0)) for k in (0, 1)]
+    floor = tfeti.Obstacle("lower", tfeti.Plane((0, 0, -1.02), normal=(0, 0, 1)))
+
+    def bcs(V):
+        return [roller(V, k, facets) for k, facets in enumerate(cuts)]
+
+    contacts = [sided(*order), floor]
+    p = solved(two_body_problem(d, pressed(d), bcs, contacts, degree, rtol=1e-10))
+    for contact in (0, 1):
+        pressure = gathered(p.solution.contact(contact).pressure)
+        assert np.allclose(pressure[pressure > 0.0], 0.1, rtol=1e-7)
 
 
 def test_options_that_did_not_reach_petsc(monkeypatch):

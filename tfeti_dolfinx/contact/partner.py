@@ -36,9 +36,12 @@ from tfeti_dolfinx.mortar.facets import (
     group_points,
     hat_areas,
     local_facets,
+    shares_at_edges,
     surface_facets,
+    unit,
     with_averaged_normals,
     with_images,
+    with_own_normals_at_edges,
 )
 from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_curvature
 from tfeti_dolfinx.mortar.multipliers import with_held_vertices
@@ -269,13 +272,9 @@ class Obstacle(ContactPartner):
             self._check_shape(dofs)
         return self, self.records(dofs, contact, reach, reach, held)
 
-    def _facets(self, dofs: TornDofs) -> Facets:
-        """Return the facets of the surface on this rank."""
-        return local_facets(dofs, dofs.decomposition.facets(self.surface), facet_kind(dofs))
-
     def _check_shape(self, dofs: TornDofs) -> None:
         """Raise an InputError unless the gradient is the distance's and a facet faces the shape."""
-        facets = self._facets(dofs)
+        facets = local_facets(dofs, dofs.decomposition.facets(self.surface), facet_kind(dofs))
         centres, size = facets.corners.mean(axis=1), diameter(dofs.decomposition)
         check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
@@ -295,7 +294,8 @@ class Obstacle(ContactPartner):
         given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
         n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
-        kind, facets = facet_kind(dofs), self._facets(dofs)
+        kind, across = facet_kind(dofs), held.across if held else None
+        facets = local_facets(dofs, dofs.decomposition.facets(self.surface), kind, across)
         corners = facets.corners
         with raised_on_all_ranks(dofs.comm):
             distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)
@@ -304,11 +304,10 @@ class Obstacle(ContactPartner):
         normals = dofs.reduce_on_owners(vertices, towards, np.maximum, -np.inf)
         normals[~np.isfinite(normals)] = 0.0  # off the surface
         sides = dofs.reduce_on_owners(vertices[at_edge], beside)
-        length = np.linalg.norm(sides, axis=1, keepdims=True)
-        normals = np.where(length > 0.0, sides / np.where(length > 0.0, length, 1.0), normals)
-        if held and held.across is not None and has_facets(self.shape):
+        normals = np.where(np.any(sides != 0.0, axis=1, keepdims=True), unit(sides), normals)
+        if across is not None and has_facets(self.shape):
             # on a plane of symmetry its facets have the normal of the smooth surface
-            inside = np.where(held.across, 0.0, normals)
+            inside = np.where(across, 0.0, normals)
             share = np.linalg.norm(inside, axis=1, keepdims=True)
             share[share < SEARCH.edge] = 1.0
             normals = np.where(share < 1.0, inside / share, normals)
@@ -316,7 +315,8 @@ class Obstacle(ContactPartner):
         if not (isinstance(self.shape, RigidBody) and self.shape.free):
             facets = with_held_vertices(facets, dofs, normals, held.flag if held else None)
         side = Side(facets, hat_areas(kind, facets), normals)
-        integrals = integrate_distance(kind, facets, distance.reshape(facets.vertices.shape))
+        share = shares_at_edges(facets, dofs, towards, across)
+        integrals = integrate_distance(kind, facets, distance.reshape(corners.shape[:2]), share)
         found = conditions(dofs, contact, side, integrals)
         if isinstance(self.shape, RigidBody):
             x = group_points(dofs)[:, : dofs.bs]
@@ -491,7 +491,7 @@ class Contact(ContactPartner):
             )
         sides, kind, across = [], facet_kind(dofs), held.across if held else None
         for surface in self.surfaces:
-            facets = local_facets(dofs, dofs.decomposition.facets(surface), kind)
+            facets = local_facets(dofs, dofs.decomposition.facets(surface), kind, across)
             whole = facets.radius ** (dofs.bs - 1)
             if count := count_over(dofs.comm, facets.area <= SEARCH.degenerate * whole):
                 raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")
@@ -515,15 +515,13 @@ class Contact(ContactPartner):
         height, deep = SEARCH.seen * reach, SEARCH.seen * depth
         distance = max(height, deep)
         moved, curved = dofs.nodes is not None, self.gap == CURVED
-        facing = with_images(sides[1].facets, dofs, across)
-        secondary, primary = rendezvous(sides[0].facets, facing, distance, comm)
+        turned, facing = (with_own_normals_at_edges(s.facets, dofs, across) for s in sides)
+        secondary, primary = rendezvous(turned, with_images(facing, dofs, across), distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
-        own, facets = sides[0], (secondary, primary)
-        normals, secondary, segments = met_at_edges(
-            dofs, own.facets, own.normals, segments, *facets, across
-        )
+        own, where = sides[0], (segments, secondary, primary, across)
+        normals, secondary, segments = met_at_edges(dofs, own.facets, own.normals, *where)
         with raised_on_all_ranks(comm):
             integrals = integrate(kind, secondary, primary, segments, moved, curved)
         averted = any_rank(comm, segments.averted)

@@ -14,7 +14,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks, count_over
+from tfeti_dolfinx.common.parallel import Exchange, any_rank, box_over_ranks, count_over
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -136,8 +136,14 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
     )
 
 
-def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
-    """Data of local facets of the true boundary, without averaged normals."""
+def local_facets(
+    dofs: TornDofs, facets: Array, kind: FacetKind, across: Array | None = None
+) -> Facets:
+    """Data of local facets of the true boundary, without averaged normals. Collective.
+
+    Those in planes of symmetry, inside of the whole, are left out, unless all are. ``across`` has
+    flags of owned groups' components, shape ``(g, gdim)``; None: there is no such plane.
+    """
     mesh = dofs.V.mesh
     gdim, (cell, place) = mesh.geometry.dim, cells_at(mesh, facets)
     coordinate = mesh.ufl_domain().ufl_coordinate_element()
@@ -155,7 +161,7 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
     normal = unit(np.where(outward < 0.0, -1.0, 1.0)[:, None] * normal)
     at_vertices = _normals(kind.geometry, x, hats.points)
     sign = np.sign(np.sum(at_vertices * normal, axis=2, keepdims=True))
-    return Facets(
+    found = Facets(
         x=np.ascontiguousarray(x),
         groups=dofs.group[dofs.facet_nodes(facets)],
         normal=normal,
@@ -164,6 +170,13 @@ def local_facets(dofs: TornDofs, facets: Array, kind: FacetKind) -> Facets:
         curvature=np.zeros((len(x), gdim, gdim)),
         held=np.zeros((len(x), hats.size), dtype=bool),
     )
+    if across is None:
+        return found
+    (at,) = dofs.lookup(found.vertices.ravel(), across)
+    kept = ~np.any(np.all(at.reshape(*found.vertices.shape, dofs.bs), axis=1), axis=1)
+    if not any_rank(dofs.comm, kept):
+        return found
+    return Facets(*(getattr(found, f.name)[kept] for f in fields(found)))
 
 
 def with_averaged_normals(
@@ -172,8 +185,7 @@ def with_averaged_normals(
     """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
     On a plane of symmetry they lie in it, as those of the whole surface, unless that has an edge
-    there at rest. ``across`` has flags of owned groups' components, shape ``(g, gdim)``; None:
-    there is none. Return the averaged normal of each owned group, too, 0 off them, shape ``(g,
+    there at rest. Return the averaged normal of each owned group, too, 0 off them, shape ``(g,
     gdim)``.
     """
     groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
@@ -211,6 +223,46 @@ def normals_at_rest(facets: Facets, dofs: TornDofs) -> tuple[Array, Array]:
     there = unit(there * np.sign(np.sum(here * facets.normal, axis=1, keepdims=True)))
     repeated = np.repeat(there, corners.shape[1], axis=0)
     return there, unit(dofs.reduce_on_owners(groups, repeated))
+
+
+def edges_at_rest(facets: Facets, dofs: TornDofs, across: Array | None) -> Array:
+    """Return where facets turn as at an edge, as they were meshed: flags of groups. Collective.
+
+    On planes of symmetry it is edges that cross them.
+    """
+    groups, (facet, averaged) = facets.vertices.ravel(), normals_at_rest(facets, dofs)
+    own = np.repeat(facet, facets.vertices.shape[1], axis=0)
+    (averaged,) = dofs.lookup(groups, averaged)
+    if across is not None:
+        (at,) = dofs.lookup(groups, across)
+        own, averaged = (unit(np.where(at, 0.0, normal)) for normal in (own, averaged))
+    cosine = np.sum(own * averaged, axis=1)
+    return dofs.reduce_on_owners(groups, cosine, np.minimum, 1.0) < SEARCH.edge
+
+
+def with_own_normals_at_edges(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:
+    """Return facets with their own normals at edges, where means are of no side. Collective."""
+    (edge,) = dofs.lookup(facets.vertices.ravel(), edges_at_rest(facets, dofs, across))
+    edge = edge.reshape(*facets.vertices.shape, 1)
+    normals = np.where(edge, facets.normal[:, None], facets.vertex_normals)
+    return replace(facets, vertex_normals=normals)
+
+
+def shares_at_edges(facets: Facets, dofs: TornDofs, towards: Array, across: Array | None) -> Array:
+    """Return how much facets beside edges count, by how they face a shape. Collective.
+
+    That is over the one that does so most, as of a pair's: a side that stands on a plane bears
+    nothing. ``towards`` has normals into the shape at the vertices, shape ``(n v, gdim)``.
+    """
+    groups, corners = facets.vertices.ravel(), facets.vertices.shape[1]
+    if dofs.bs == 1 or not any_rank(dofs.comm, edge := edges_at_rest(facets, dofs, across)):
+        return np.ones(len(facets))
+    cosine = np.sum(np.repeat(facets.normal, corners, axis=0) * towards, axis=1)
+    cosine = np.maximum(cosine, SEARCH.turned)
+    most = dofs.reduce_on_owners(groups, cosine, np.maximum)
+    most, sharp = dofs.lookup(groups, most, edge)
+    counts = np.where(sharp, cosine / most, 1.0) ** SEARCH.aside
+    return counts.reshape(-1, corners).min(axis=1)
 
 
 def with_images(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:

@@ -246,10 +246,13 @@ def _above_lowest(
     return replace(dual, weighted=(1.0 - part) * dual.weighted + part * hats)
 
 
-def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> MortarIntegrals:
-    """Return integrals over facets with an obstacle's distance at vertices, ``(n, v)``."""
+def integrate_distance(
+    kind: FacetKind, facets: Facets, distance: Array, share: Array
+) -> MortarIntegrals:
+    """Return integrals over facets' shares with an obstacle's distance at vertices, ``(n, v)``."""
     # exact for ψ_i φ_k on plane facets, and enough on curved ones
     facet, xi, weight = whole_facets(kind, facets, 4 * kind.displacement.degree)
+    weight = weight * share[facet]
     held = facets.held & (kind.displacement.degree > 1)
     dual = facet_multipliers(kind, facets, facet, xi, weight, held)
     if np.any(held):

@@ -19,8 +19,8 @@ from tfeti_dolfinx.mortar.facets import (
     FacetKind,
     Facets,
     densities,
+    edges_at_rest,
     facet_kind,
-    normals_at_rest,
     points,
     reference_points,
     unit,
@@ -229,16 +229,10 @@ def met_at_edges(
 
     The mean of an edge's faces is no direction in which an edge that slides is stopped, and a side
     that stands on what the edge meets does not bear. Edges are those at rest of the surface's
-    ``own`` facets on this rank; ``normals`` are of owned groups. Those on planes of symmetry, by
-    flags ``across`` of groups' components, keep theirs.
+    ``own`` facets on this rank; ``normals`` are of owned groups. On planes of symmetry, by flags
+    ``across`` of groups' components, they stay in these.
     """
-    groups, at = own.vertices, segments.points
-    facet, averaged = normals_at_rest(own, dofs)
-    (averaged,) = dofs.lookup(groups.ravel(), averaged)
-    cosine = np.sum(averaged.reshape(*groups.shape, dofs.bs) * facet[:, None], axis=2)
-    edge = dofs.reduce_on_owners(groups.ravel(), cosine.ravel(), np.minimum, 1.0) < SEARCH.edge
-    if across is not None:
-        edge &= ~np.any(across, axis=1)
+    at, edge = segments.points, edges_at_rest(own, dofs, across)
     if not any_rank(dofs.comm, edge):
         return normals, secondary, segments
     # 1. facets beside an edge count as they face what they meet, over the one that does so most
@@ -253,7 +247,8 @@ def met_at_edges(
     share = segments.weight[:, None] * hats.values(at.xi)
     faced = -points(hats, primary.vertex_normals[at.primary], at.eta)
     faced = (share[:, :, None] * faced[:, None]).reshape(-1, dofs.bs)
-    faced = unit(dofs.reduce_on_owners(vertices[s].ravel(), faced))
+    faced = dofs.reduce_on_owners(vertices[s].ravel(), faced)
+    faced = unit(faced if across is None else np.where(across, 0.0, faced))
     normals = np.where(edge[:, None] & np.any(faced != 0.0, axis=1, keepdims=True), faced, normals)
     (turned,) = dofs.lookup(vertices.ravel(), normals)
     turned = turned.reshape(secondary.corners.shape)
