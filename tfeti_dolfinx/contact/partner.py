@@ -374,6 +374,7 @@ class Contact(ContactPartner):
     """Two surfaces may not enter each other.
 
     Where facets of the secondary side turn by more than 40°, the normal is that of what they meet.
+    So a surface may be a whole boundary: sides that stand on what an edge meets bear nothing.
 
     Args:
         a: Name or tag of a surface.
