@@ -31,6 +31,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
     Facets,
+    apart_at_edges,
     diameter,
     facet_kind,
     group_points,
@@ -41,7 +42,6 @@ from tfeti_dolfinx.mortar.facets import (
     unit,
     with_averaged_normals,
     with_images,
-    with_own_normals_at_edges,
 )
 from tfeti_dolfinx.mortar.integrals import integrate, integrate_distance, with_curvature
 from tfeti_dolfinx.mortar.multipliers import with_held_vertices
@@ -516,13 +516,13 @@ class Contact(ContactPartner):
         height, deep = SEARCH.seen * reach, SEARCH.seen * depth
         distance = max(height, deep)
         moved, curved = dofs.nodes is not None, self.gap == CURVED
-        turned, facing = (with_own_normals_at_edges(s.facets, dofs, across) for s in sides)
-        secondary, primary = rendezvous(turned, with_images(facing, dofs, across), distance, comm)
+        (apart, edge), (facing, _) = (apart_at_edges(s.facets, dofs, across) for s in sides)
+        secondary, primary = rendezvous(apart, with_images(facing, dofs, across), distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
         own, where = sides[0], (segments, secondary, primary, across)
-        normals, secondary, segments = met_at_edges(dofs, own.facets, own.normals, *where)
+        normals, secondary, segments = met_at_edges(dofs, edge, own.normals, *where)
         with raised_on_all_ranks(comm):
             integrals = integrate(kind, secondary, primary, segments, moved, curved)
         averted = any_rank(comm, segments.averted)

@@ -240,12 +240,16 @@ def edges_at_rest(facets: Facets, dofs: TornDofs, across: Array | None) -> Array
     return dofs.reduce_on_owners(groups, cosine, np.minimum, 1.0) < SEARCH.edge
 
 
-def with_own_normals_at_edges(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:
-    """Return facets with their own normals at edges, where means are of no side. Collective."""
-    (edge,) = dofs.lookup(facets.vertices.ravel(), edges_at_rest(facets, dofs, across))
-    edge = edge.reshape(*facets.vertices.shape, 1)
-    normals = np.where(edge, facets.normal[:, None], facets.vertex_normals)
-    return replace(facets, vertex_normals=normals)
+def apart_at_edges(facets: Facets, dofs: TornDofs, across: Array | None) -> tuple[Facets, Array]:
+    """Return facets with their own normals at edges, and which groups are at these. Collective.
+
+    A mean is of no side there.
+    """
+    edges = edges_at_rest(facets, dofs, across)
+    (at,) = dofs.lookup(facets.vertices.ravel(), edges)
+    at = at.reshape(*facets.vertices.shape, 1)
+    normals = np.where(at, facets.normal[:, None], facets.vertex_normals)
+    return replace(facets, vertex_normals=normals), edges
 
 
 def shares_at_edges(facets: Facets, dofs: TornDofs, towards: Array, across: Array | None) -> Array:

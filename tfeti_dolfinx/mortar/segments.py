@@ -19,7 +19,6 @@ from tfeti_dolfinx.mortar.facets import (
     FacetKind,
     Facets,
     densities,
-    edges_at_rest,
     facet_kind,
     points,
     reference_points,
@@ -218,7 +217,7 @@ def find_segments(
 
 def met_at_edges(
     dofs: TornDofs,
-    own: Facets,
+    edge: Array,
     normals: Array,
     segments: Segments,
     secondary: Facets,
@@ -228,11 +227,10 @@ def met_at_edges(
     """Return normals, secondary facets and segments whose edges face what they meet. Collective.
 
     The mean of an edge's faces is no direction in which an edge that slides is stopped, and a side
-    that stands on what the edge meets does not bear. Edges are those at rest of the surface's
-    ``own`` facets on this rank; ``normals`` are of owned groups. On planes of symmetry, by flags
-    ``across`` of groups' components, they stay in these.
+    that stands on what the edge meets does not bear. Owned groups have flags ``edge``, as at rest,
+    and ``normals``; on planes of symmetry, by flags ``across`` of components, these stay in them.
     """
-    at, edge = segments.points, edges_at_rest(own, dofs, across)
+    at = segments.points
     if not any_rank(dofs.comm, edge):
         return normals, secondary, segments
     # 1. facets beside an edge count as they face what they meet, over the one that does so most
