@@ -353,3 +353,37 @@ def test_loads_and_a_stiffness_whose_squares_leave_the_range_are_named(size):
     assert not np.any(scene.solve((0.0, 0.0)))
     with pytest.raises(tfeti.InputError, match="stiffness of .* squares leave the range"):
         Scene("triangle", stress=hooke(1e-300)).solve((0.0, -1e-302))
+
+
+def test_a_body_that_nothing_acts_on_any_more_limits_no_answer():
+    """A block that is pressed to a rough wall is lifted off another one, which is at rest then."""
+    d = stacked("hexahedron", 3, 4)
+    x, rubs = np.eye(3)[0], {"friction": tfeti.Coulomb(0.3)}
+    lift = fem.Constant(d.mesh, 0.0)
+    contacts = [
+        sided("upper bottom", "lower top", **rubs),
+        tfeti.Obstacle("upper left", tfeti.Plane(0.0 * x, x), gap=0.0, **rubs),
+    ]
+    sides = "lower bottom", "lower left", "lower front", "upper front"
+    given = drawn(d, "upper right", -0.01 * x), held(d, *sides, ("upper top", lift))
+    p = two_body_problem(d, *given, contacts)
+    for lift.value in (-0.01, 0.02, 0.03, 0.02, -0.01):
+        assert accepted(p).F_multiplications <= 60
+        points, u = displacement(p)
+        moved = np.abs(u[points[:, -1] < -0.01]).max()
+        assert (moved <= 1e-6 * np.abs(u).max()) == (lift.value > 0.0)
+
+
+def test_a_corner_of_rough_walls_is_unloaded():
+    """Nodes on several walls have more rows than unknowns: their forces are not unique."""
+    d, rubs = decomposed("hexahedron", 4, 5), {"gap": 0.0, "friction": tfeti.Coulomb(0.6)}
+    contacts = [
+        tfeti.Obstacle(side, tfeti.Plane((0, 0, 0), normal), **rubs)
+        for side, normal in zip(("left", "front", "bottom"), np.eye(3), strict=True)
+    ]
+    top, right = (fem.Constant(d.mesh, np.zeros(3)) for _ in range(2))
+    above, beside = drawn(d, "top", top), drawn(d, "right", right)
+    p = two_body_problem(d, lambda v, ds: above(v, ds) + beside(v, ds), lambda V: [], contacts)
+    for factor in (1.0, 0.05):
+        top.value[:], right.value[:] = factor * np.array([[-0.02, -0.1, -0.1], [-0.1, 0.0, 0.0]])
+        assert accepted(p).F_multiplications <= 600

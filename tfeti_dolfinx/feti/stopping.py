@@ -66,6 +66,7 @@ class Measures:
     change: Array  # largest change of each body since the iterate before, loose motions apart, or 0
     alone: Array  # largest displacement K⁺f of the trace of each body
     stiffness: Array  # trace of K on the trace unknowns of each body
+    pushed: Array  # size of what contact and prescribed values do to each body, squared; 0: nothing
     # deepest overlap, distance of a row that carries a force, or slip that friction does not allow
     penetration: float
     balance: float  # force left on a kernel mode, where it is largest beside the forces there
@@ -128,8 +129,11 @@ def measure(
     if len(sets.springs):
         ends = sums(dual.coarse.sigma * w[sets.springs] ** 2, subdomains.spring_parts)
         closing = [a + b for a, b in zip(closing, ends, strict=True)]
-    energies, correction_energies, stiffness = subdomains.of_bodies(
-        [subdomains.energies(u), closing, sums(diagonal, trace)]
+    pushing = np.array(c)
+    pushing[sets.contact] = state.lam[sets.contact]
+    pushing = constraints.forces(pushing) ** 2
+    energies, correction_energies, stiffness, pushed = subdomains.of_bodies(
+        [subdomains.energies(u), closing, sums(diagonal, trace), sums(pushing, trace)]
     )
     displacements = (
         u,
@@ -163,6 +167,7 @@ def measure(
         change=change,
         alone=alone,
         stiffness=stiffness,
+        pushed=pushed,
         penetration=float(largest[0]),
         balance=balance,
         forces=forces,
@@ -397,7 +402,9 @@ class Accuracy(StoppingRule):
         noise = np.maximum(noise, self._dual.negligible)
         displacement = self.rtol * share * now.size + noise
         largest = float(displacement.max(initial=0.0))
-        displacement = np.maximum(displacement, at_rest)
+        # a body that nothing acts on, as one that was unloaded, rests: all of its u is error
+        rests = (now.alone == 0.0) & (now.pushed == 0.0)
+        displacement = np.maximum.reduce((displacement, at_rest, self.rtol * most * rests))
         # rounding of bodies that do not deform at all: its energy, and forces that make it
         rigid = float(np.sqrt(now.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
         balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self._norm)

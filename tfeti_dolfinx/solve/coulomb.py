@@ -372,10 +372,11 @@ class NewtonOnLaw:
     ) -> tuple[Array, Array] | None:
         """Go on from the first answer, which has only been looked at, or go back.
 
-        Then bounds become those before the answer, and Newton's method is tried no more.
+        Where Newton's method fails, the problem with its bounds goes on. To go back bounds become
+        those before the answer, and Newton's method is tried no more.
         """
         before = self._before
-        again = self.solve(law, bounds, aim) if looked else None
+        again = (self.solve(law, bounds, aim) or law) if looked else None
         if again is None:
             self.tries, self._dual.recycled, bounds.now = 0, self._recycled, before
         self._before = before
