@@ -516,13 +516,13 @@ class Contact(ContactPartner):
         height, deep = SEARCH.seen * reach, SEARCH.seen * depth
         distance = max(height, deep)
         moved, curved = dofs.nodes is not None, self.gap == CURVED
-        (apart, edge), (facing, _) = (apart_at_edges(s.facets, dofs, across) for s in sides)
-        secondary, primary = rendezvous(apart, with_images(facing, dofs, across), distance, comm)
+        apart, edges = zip(*(apart_at_edges(s.facets, dofs, across) for s in sides), strict=True)
+        secondary, primary = rendezvous(apart[0], with_images(apart[1], dofs, across), distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)
         own, where = sides[0], (segments, secondary, primary, across)
-        normals, secondary, segments = met_at_edges(dofs, edge, own.normals, *where)
+        normals, secondary, segments = met_at_edges(dofs, edges, own.normals, *where)
         with raised_on_all_ranks(comm):
             integrals = integrate(kind, secondary, primary, segments, moved, curved)
         averted = any_rank(comm, segments.averted)

@@ -200,7 +200,11 @@ def find_segments(
     found = found[facing & ~planes.behind(found, facing)]
     # 3. of several layers the first
     found = found[planes.first_layer(found)]
-    # 4. quadrature on the planes, and the points of both facets over it
+    # 4. a body reaches into another from the side where it lies deeper in it than it is wide there
+    covered = np.bincount(found.s, found.parts.size, minlength=len(secondary)) / planes.size
+    width = np.where(covered < 1.0 - SEARCH.uncovered, 2.0 * covered * secondary.radius, np.inf)
+    found = found[found.distance >= -width[found.s]]
+    # 5. quadrature on the planes, and the points of both facets over it
     pair, y, weight = found.parts.quadrature(_degree(kind, secondary, primary))
     at, s = planes.facing(found, pair, y), found.s[pair]
     on_plane = densities(kind.geometry, planes.nodes[s], at.xi)
@@ -217,30 +221,31 @@ def find_segments(
 
 def met_at_edges(
     dofs: TornDofs,
-    edge: Array,
+    edges: tuple[Array, Array],
     normals: Array,
     segments: Segments,
     secondary: Facets,
     primary: Facets,
     across: Array | None,
 ) -> tuple[Array, Facets, Segments]:
-    """Return normals, secondary facets and segments whose edges face what they meet. Collective.
+    """Return normals, secondary facets and segments of surfaces with edges. Collective.
 
     The mean of an edge's faces is no direction in which an edge that slides is stopped, and a side
-    that stands on what the edge meets does not bear. Owned groups have flags ``edge``, as at rest,
-    and ``normals``; on planes of symmetry, by flags ``across`` of components, these stay in them.
+    that stands on what the other body has there does not bear. Owned groups have flags ``edges`` of
+    both surfaces, as at rest, and ``normals`` of the secondary one; on planes of symmetry, by flags
+    ``across`` of components, these stay in them.
     """
-    at = segments.points
-    if not any_rank(dofs.comm, edge):
+    at, edge = segments.points, edges[0]
+    if not any_rank(dofs.comm, bool(np.any(edges))):
         return normals, secondary, segments
-    # 1. facets beside an edge count as they face what they meet, over the one that does so most
+    # 1. facets count as they face each other, beside those at the same vertices that do so most
     hats, vertices, s = facet_kind(dofs).hats, secondary.vertices, at.secondary
-    cosine = np.sum(secondary.normal[s] * primary.normal[at.primary], axis=1)
-    cosine = np.repeat(np.maximum(-cosine, 0.0)[:, None], hats.size, axis=1)
-    most = dofs.reduce_on_owners(vertices[s].ravel(), cosine.ravel(), np.maximum)
-    most, sharp = (x.reshape(vertices.shape)[s] for x in dofs.lookup(vertices.ravel(), most, edge))
-    counts = np.where(sharp, quotient(cosine, most), 1.0).min(axis=1) ** SEARCH.aside
-    segments = replace(segments, weight=segments.weight * counts)
+    cosine = np.maximum(-np.sum(secondary.normal[s] * primary.normal[at.primary], axis=1), 0.0)
+    most = dofs.reduce_on_owners(vertices[s].ravel(), np.repeat(cosine, hats.size), np.maximum)
+    most, sharp = (x.reshape(vertices.shape) for x in dofs.lookup(vertices.ravel(), most, edge))
+    enough = np.where(sharp.any(axis=1), 1.0, SEARCH.aslant) * most.max(axis=1, initial=0.0)
+    seen = np.minimum(quotient(cosine, enough[s]), 1.0) ** SEARCH.aside
+    segments = replace(segments, weight=segments.weight * seen)
     # 2. the mean of what an edge meets is its normal
     share = segments.weight[:, None] * hats.values(at.xi)
     faced = -points(hats, primary.vertex_normals[at.primary], at.eta)

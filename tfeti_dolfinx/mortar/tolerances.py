@@ -13,8 +13,10 @@ class SearchTolerances:
     # cosine of 20°: facets that turn by twice that at a vertex have an edge there, others are those
     # of a smooth surface, with ten facets or more around a pin
     edge: float = 0.94
-    # power of the cosine by which facets beside an edge count: a side that bulges towards what the
-    # edge meets by 10° counts a thousandth, by 30° a sixteenth
+    # of surfaces with edges: facets that face each other by less than this, beside the best ones
+    # there, count by a power of what they lack: a side that bulges towards what its edge meets by
+    # 10° counts a hundredth, by 30° half
+    aslant: float = 0.6
     aside: float = 4.0
     # how much farther a normal is turned beside a plane of symmetry than on it, where the surface
     # bends towards it: twice on an arc of equal facets, 1 on a plane that meets it at a slant
