@@ -26,10 +26,6 @@ TIMES = [0.5, 1.0, 1.75, 2.5, 3.25]
 LAST = MPI.COMM_WORLD.size - 1
 
 
-def die():
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
 def die_at(name, count, before):
     """End the process when a file gets this name for the count-th time, before or after it has.
 
@@ -41,10 +37,10 @@ def die_at(name, count, before):
         now = Path(target).name == name and next(times) == count
         if now and before:
             os.truncate(source, os.path.getsize(source) // 2)
-            die()
+            os.kill(os.getpid(), signal.SIGKILL)
         rename(source, target)
         if now:
-            die()
+            os.kill(os.getpid(), signal.SIGKILL)
 
     os.replace = replace
 
@@ -118,7 +114,7 @@ def solve(folder, how):
 
     def apply(problem, t):
         if t == TIMES[3] and how == "between":
-            die()
+            os.kill(os.getpid(), signal.SIGKILL)
         driven.apply(problem, t)
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -10,12 +10,10 @@ from scenes import box, decomposed, integral, largest, roller, solved, vectors
 import tfeti_dolfinx as tfeti
 
 PRESSURE, YOUNG, POISSON = 0.1, 2.0, 0.3
-CELLS = {
-    "3d": ("tetrahedron", "hexahedron"),
-    "plane_strain": ("triangle", "quadrilateral"),
-    "plane_stress": ("triangle", "quadrilateral"),
-    "axisymmetric": ("triangle", "quadrilateral"),
-}
+PLANE = dict.fromkeys(
+    ("plane_strain", "plane_stress", "axisymmetric"), ("triangle", "quadrilateral")
+)
+CELLS = {"3d": ("tetrahedron", "hexahedron"), **PLANE}
 # of each model both cells and both degrees
 SCENES = [(model, CELLS[model][degree - 1], degree) for model in CELLS for degree in (1, 2)]
 

@@ -65,26 +65,19 @@ def quarter_ring(order=1, hexahedra=False):
     """Radii 0.5 and 1, height 1, a quarter; volume "body", outer curved surface "mantle"."""
     gmsh.model.add("ring")
     geo = gmsh.model.geo
-    centre = geo.addPoint(0, 0, 0)
-    inner = [geo.addPoint(0.5, 0, 0), geo.addPoint(0, 0.5, 0)]
-    outer = [geo.addPoint(1, 0, 0), geo.addPoint(0, 1, 0)]
-    curves = [
-        geo.addLine(inner[0], outer[0]),
-        geo.addCircleArc(outer[0], centre, outer[1]),
-        geo.addLine(outer[1], inner[1]),
-        geo.addCircleArc(inner[1], centre, inner[0]),
-    ]
-    base = geo.addPlaneSurface([geo.addCurveLoop(curves)])
-    for curve, nodes in zip(curves, (4, 7, 4, 7), strict=True):
-        geo.mesh.setTransfiniteCurve(curve, nodes)
-    geo.mesh.setTransfiniteSurface(base)
+    corners = [geo.addPoint(x, 0, z) for x, z in ((0.5, 0), (1, 0), (1, 1), (0.5, 1))]
+    sides = [geo.addLine(corners[i - 1], corners[i]) for i in range(4)]
+    section = geo.addPlaneSurface([geo.addCurveLoop(sides)])
+    for side in sides:
+        geo.mesh.setTransfiniteCurve(side, 4)
+    geo.mesh.setTransfiniteSurface(section)
     if hexahedra:
-        geo.mesh.setRecombine(2, base)
-    made = geo.extrude([(2, base)], 0, 0, 1, numElements=[3], recombine=hexahedra)
+        geo.mesh.setRecombine(2, section)
+    axis, way = (0, 0, 0, 0, 0, 1), {"numElements": [6], "recombine": hexahedra}
+    made = geo.revolve([(2, section)], *axis, np.pi / 2, **way)
     geo.synchronize()
-    volume = next(tag for dim, tag in made if dim == 3)
-    gmsh.model.addPhysicalGroup(3, [volume], name="body")
-    gmsh.model.addPhysicalGroup(2, [made[3][1]], name="mantle")
+    gmsh.model.addPhysicalGroup(3, [made[1][1]], name="body")
+    gmsh.model.addPhysicalGroup(2, [made[4][1]], name="mantle")
     gmsh.model.mesh.generate(3)
     gmsh.model.mesh.setOrder(order)
 

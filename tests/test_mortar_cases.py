@@ -44,11 +44,8 @@ def flat(name, low, high, n, width=1.0):
 @pytest.mark.parametrize(("apart", "radius"), [(0.1, 1.0), (0.5, None)])
 def test_only_the_first_of_two_layers_is_met(apart, radius):
     """The primary surface has the lower box's top and, below it, another one's."""
-    parts = [
-        flat("base", -apart - 0.7, -apart - 0.2, 3),
-        flat("lower", -apart, 0.0, 3),
-        flat("upper", 0.0, 1.0, 4),
-    ]
+    parts = [flat("base", -apart - 0.7, -apart - 0.2, 3), flat("lower", -apart, 0.0, 3)]
+    parts.append(flat("upper", 0.0, 1.0, 4))
     d = decomposed_boxes(parts, 6, [("tops", ["base top", "lower top"])])
     sides = ["base bottom", "base left", "lower left", "lower bottom", "upper left"]
     contact = sided("upper bottom", "tops", reach=radius)
@@ -61,10 +58,7 @@ def test_only_the_first_of_two_layers_is_met(apart, radius):
 def test_thin_plates_are_not_met_from_behind(thickness, radius):
     """Both faces of both plates are in the surfaces: the outer ones face through the plates."""
     parts = [flat("lower", -thickness, 0.0, 6), flat("upper", 0.0, thickness, 8)]
-    groups = [
-        ("lower faces", ["lower bottom", "lower top"]),
-        ("upper faces", ["upper bottom", "upper top"]),
-    ]
+    groups = [(f"{a} faces", [f"{a} bottom", f"{a} top"]) for a in ("lower", "upper")]
     d = decomposed_boxes(parts, 4, groups)
     records = searched([sided("upper faces", "lower faces", reach=radius)], dofs_on(d))
     assert MPI.COMM_WORLD.allreduce(len(records)) == 9
@@ -113,24 +107,15 @@ def test_facets_of_second_order_touch_without_overlap(comm):
     assert np.isclose(*forces, rtol=0.03)
 
 
-def test_edges_take_normals_of_what_they_meet_and_are_warned_of(caplog):
-    parts = [("lower", (0.0, -1.0), (1.5, 0.0), (3, 3)), ("upper", (0.0, 0.0), (1.0, 1.0), (4, 4))]
-    d = decomposed_boxes(parts, 4, [("corner", ["upper bottom", "upper right"])])
-    bcs = held(d, "lower bottom", "lower left", "upper left")
-    p = solved(two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")]))
-    assert np.allclose(p.solution.contact().normal, (0.0, -1.0))  # at the edge, too
-    assert ("'corner' has edges" in caplog.text) == (d.comm.rank == 0)
-
-
 @pytest.mark.parametrize("order", [("lower", "upper"), ("upper", "lower")])
 @pytest.mark.parametrize("degree", [1, 2])
-def test_whole_boundaries_press_as_their_faces_alone(order, degree):
+def test_whole_boundaries_press_as_their_faces_alone(order, degree, caplog):
     """Of a quarter of two cubes on a plane, apart at first, cuts and sides bear nothing."""
     low, high = ((0.0, 0.0, -1.0), (1.0, 1.0, 0.0)), ((0.0, 0.0, 0.05), (1.0, 1.0, 1.0))
     parts = [("lower", *low, (2, 2, 2)), ("upper", *high, (3, 3, 2))]
-    ends = [("lower", "top"), ("lower", "bottom"), ("upper", "bottom")]
-    around = [(body, side) for body in order for side in ("left", "right", "front", "back")]
-    skins = [(body, [f"{a} {side}" for a, side in ends + around if a == body]) for body in order]
+    sides = {body: ["left", "right", "front", "back", "bottom"] for body in order}
+    sides["lower"].append("top")
+    skins = [(body, [f"{body} {side}" for side in sides[body]]) for body in order]
     d = decomposed_boxes(parts, 4, skins, "hexahedron")
     cuts = [d.locate_facets(lambda x, k=k: np.isclose(x[k], 0.0)) for k in (0, 1)]
     floor = tfeti.Obstacle("lower", tfeti.Plane((0, 0, -1.02), normal=(0, 0, 1)))
@@ -138,11 +123,11 @@ def test_whole_boundaries_press_as_their_faces_alone(order, degree):
     def bcs(V):
         return [roller(V, k, facets) for k, facets in enumerate(cuts)]
 
-    contacts = [sided(*order), floor]
-    p = solved(two_body_problem(d, pressed(d), bcs, contacts, degree, rtol=1e-10))
+    p = solved(two_body_problem(d, pressed(d), bcs, [sided(*order), floor], degree, rtol=1e-10))
     for contact in (0, 1):
         pressure = gathered(p.solution.contact(contact).pressure)
         assert np.allclose(pressure[pressure > 0.0], 0.1, rtol=1e-7)
+    assert ("has edges" in caplog.text) == (d.comm.rank == 0)
 
 
 def test_options_that_did_not_reach_petsc(monkeypatch):

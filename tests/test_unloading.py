@@ -23,6 +23,7 @@ SIZES = {"triangle": (6, 3), "quadrilateral": (8, 4), "hexahedron": (3, 4), "tet
 # clamped and loaded sides; what is clamped on top is moved
 KINDS = {"loaded": ("left", "top"), "driven": ("top", "right")}
 LAWS = ("none", "tresca", "coulomb", "orthotropic")
+PLAIN = {"none": (None, 0.0), "tresca": (tfeti.Tresca(0.003), 0.003)}
 DIRECTION = 0.4  # of the first axis of orthotropic friction, from x
 STEPS = ("new", "zero", "same", "turned", "tiny", "less", "other tiny")
 
@@ -31,12 +32,8 @@ def law(name, gdim):
     """The law, its semi-axes or coefficients, and the frame that they hold in."""
     normal = -np.eye(gdim)[-1]
     if gdim == 2 or name != "orthotropic":
-        frame = np.stack((normal, *np.eye(gdim)[:-1]))
-        if name == "none":
-            return None, (0.0,) * (gdim - 1), frame
-        value = 0.003 if name == "tresca" else 0.3
-        given = tfeti.Tresca(value) if name == "tresca" else tfeti.Coulomb(value)
-        return given, (value,) * (gdim - 1), frame
+        given, value = PLAIN.get(name, (tfeti.Coulomb(0.3), 0.3))
+        return given, (value,) * (gdim - 1), np.stack((normal, *np.eye(gdim)[:-1]))
     along = np.array([np.cos(DIRECTION), np.sin(DIRECTION), 0.0])
     given = tfeti.Coulomb((0.4, 0.15), direction=along)
     return given, (0.4, 0.15), np.stack((normal, along, np.cross(normal, along)))

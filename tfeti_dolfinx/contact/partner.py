@@ -513,11 +513,11 @@ class Contact(ContactPartner):
     ) -> ContactRecords:
         """Return conditions from integrals over the first side's facets that face the second."""
         kind, comm, across = facet_kind(dofs), dofs.comm, held.across if held else None
-        height, deep = SEARCH.seen * reach, SEARCH.seen * depth
-        distance = max(height, deep)
         moved, curved = dofs.nodes is not None, self.gap == CURVED
+        distance = max(height := SEARCH.seen * reach, deep := SEARCH.seen * depth)
         apart, edges = zip(*(apart_at_edges(s.facets, dofs, across) for s in sides), strict=True)
-        secondary, primary = rendezvous(apart[0], with_images(apart[1], dofs, across), distance, comm)
+        images = with_images(apart[1], dofs, across)
+        secondary, primary = rendezvous(apart[0], images, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height)

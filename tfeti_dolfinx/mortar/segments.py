@@ -201,8 +201,8 @@ def find_segments(
     # 3. of several layers the first
     found = found[planes.first_layer(found)]
     # 4. a body reaches into another from the side where it lies deeper in it than it is wide there
-    covered = np.bincount(found.s, found.parts.size, minlength=len(secondary)) / planes.size
-    width = np.where(covered < 1.0 - SEARCH.uncovered, 2.0 * covered * secondary.radius, np.inf)
+    share = np.bincount(found.s, found.parts.size, minlength=len(secondary)) / planes.size
+    width = np.where(share < 1.0 - SEARCH.uncovered, 2.0 * share * secondary.radius, np.inf)
     found = found[found.distance >= -width[found.s]]
     # 5. quadrature on the planes, and the points of both facets over it
     pair, y, weight = found.parts.quadrature(_degree(kind, secondary, primary))
