@@ -14,9 +14,9 @@ class SearchTolerances:
     # of a smooth surface, with ten facets or more around a pin
     edge: float = 0.94
     # of surfaces with edges: facets that face each other by less than the best ones there beside an
-    # edge of the secondary side, elsewhere by less than this share of them, count by a power of what
-    # they lack: a side that bulges by 10° towards what its edge meets counts a thousandth, by 30° a
-    # sixteenth
+    # edge of the secondary side, elsewhere by less than this share of them, count by a power of
+    # what they lack: a side that bulges by 10° towards what its edge meets counts a thousandth, by
+    # 30° a sixteenth
     aslant: float = 0.6
     aside: float = 4.0
     # how much farther a normal is turned beside a plane of symmetry than on it, where the surface
