@@ -173,7 +173,9 @@ def local_facets(
     if across is None:
         return found
     (at,) = dofs.lookup(found.vertices.ravel(), across)
-    kept = ~np.any(np.all(at.reshape(*found.vertices.shape, dofs.bs), axis=1), axis=1)
+    at = np.all(at.reshape(*found.vertices.shape, dofs.bs), axis=1)
+    # others reach from one plane to another, in a slab of one cell
+    kept = ~np.any(at & (np.abs(found.normal) > 1.0 - SEARCH.held), axis=1)
     if not any_rank(dofs.comm, kept):
         return found
     return Facets(*(getattr(found, f.name)[kept] for f in fields(found)))
