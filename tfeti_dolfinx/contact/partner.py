@@ -520,7 +520,7 @@ class Contact(ContactPartner):
         secondary, primary = rendezvous(apart[0], images, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
-            segments = find_segments(kind, secondary, primary, pairs, deep, height)
+            segments = find_segments(kind, secondary, primary, pairs, deep, height, moved)
         own, where = sides[0], (segments, secondary, primary, across)
         normals, secondary, segments = met_at_edges(dofs, edges, own.normals, *where)
         with raised_on_all_ranks(comm):

@@ -181,12 +181,13 @@ def find_segments(
     pairs: tuple[Array, Array],
     depth: float,
     height: float,
+    moved: bool,
 ) -> Segments:
     """Clip pairs of facets on the secondary facets' averaged normal planes.
 
     Facets that overlap by more than the depth along the normal, or are farther apart than the
     height, do not meet; these lengths are exceeded by the facets' own sizes, so that no facet
-    within them is covered in part only.
+    within them is covered in part only. Those that have ``moved`` may be reached from the side.
     """
     planes = _Planes(kind, secondary, primary)
     # 1. common parts of facets that are neither too far nor seen from the side
@@ -202,7 +203,8 @@ def find_segments(
     found = found[planes.first_layer(found)]
     # 4. a body reaches into another from the side where it lies deeper in it than it is wide there
     share = np.bincount(found.s, found.parts.size, minlength=len(secondary)) / planes.size
-    width = np.where(share < 1.0 - SEARCH.uncovered, 2.0 * share * secondary.radius, np.inf)
+    partly = moved & (share < 1.0 - SEARCH.uncovered)
+    width = np.where(partly, 2.0 * share * secondary.radius, np.inf)
     found = found[found.distance >= -width[found.s]]
     # 5. quadrature on the planes, and the points of both facets over it
     pair, y, weight = found.parts.quadrature(_degree(kind, secondary, primary))
