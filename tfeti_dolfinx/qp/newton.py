@@ -59,9 +59,11 @@ class NewtonParameters:
     # what a solve on a face that stays reduces its residual to, before step 1 looks at it
     stage: float = 0.1
     patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
+    in_part: int = 3  # steps in a row that do not halve it: from then on ways may be taken in part
     circle: int = 300  # steps in a row that do not halve ‖g^P‖: q falls by what Gλ = e lacks
     lost: float = 2e-15  # of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖
-    rounding: float = 1e-10  # of the largest entry of a way: less is none
+    # of the largest entry of a way: less is none; and of ‖F‖: a curvature that rounding may hide
+    rounding: float = 1e-10
     hidden: float = 1e-15  # of the terms of q: what its differences may be wrong by
     short: float = 1e-6  # of a gradient: a projection that is shorter may be rounding
     past: float = 1e-15  # of the way to a bound: so far past it, or rounding leaves a force there
@@ -235,8 +237,9 @@ class NewtonIteration:
             self.least, self.idle, self.since = self.residual, 0, 0
 
     def examine(self, rule: StoppingRule) -> ConvergedReason:
-        """Apply the stopping rule where ‖g^P‖ is small enough."""
-        if self.residual > max(rule.tolerance, self.rounding):
+        """Apply the stopping rule where ‖g^P‖ is small enough, or hardly falls."""
+        stalls = self.since > 0 and self.since % self.parameters.patience == 0
+        if self.residual > max(rule.tolerance, self.rounding) and not stalls:
             return ConvergedReason.ITERATING
         reason = rule.examine(self.z.lam, self.s, self.pressed, self.residual, self.norm)
         if reason == ConvergedReason.ITERATING and self.qp.rough is not None:
@@ -273,18 +276,20 @@ class NewtonIteration:
     def accept(self, end: Point, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
 
-        That is the end of step 3, else the projected gradient step or the part of it where q is
-        least.
+        That is the end of step 3, the point on the way there where q is least, or the projected
+        gradient step or the part of it where q is least.
         """
         looked = np.isfinite(self.residual)
         enough = self.parameters.enough * 0.5 / self.norm * self.residual**2 if looked else 0.0
         # on circles s and λ are both large: their product's rounding hides changes of q; what falls
         # is q without terms that Gλ = e makes constant
-        z = self.z
-        hidden, double = self.qp.dot(
-            (np.abs(z.lam), np.abs(self.s)), (z.lam - end.lam, end.g - z.g + 2.0 * self.s)
+        z, way, image = self.z, end.lam - self.z.lam, end.g - self.z.g
+        hidden, slope, curvature = self.qp.dot(
+            (np.abs(z.lam), np.abs(self.s)), (way, -self.s), (way, image)
         )
-        taken = feasible and 0.5 * double >= enough - self.parameters.hidden * hidden
+        double, needed = 2.0 * slope - curvature, enough - self.parameters.hidden * hidden
+        taken = feasible and 0.5 * double >= needed
+        stuck = self.since >= self.parameters.in_part and slope > 0.0
         self.resume = taken
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
         unbalanced, self.unbalanced = self.unbalanced and not feasible, not feasible
@@ -292,6 +297,10 @@ class NewtonIteration:
         self.cautious = self.parameters.cautious and early
         if taken:
             self._go(end, 0.5 * double)
+        elif stuck and feasible and slope < curvature and 0.5 * slope**2 >= needed * curvature:
+            # the way to the end is in Ω, which is convex; q is least here
+            t, taken = slope / curvature, True
+            self._go(Point(z.lam + t * way, z.g + t * image), 0.5 * t * slope)
         if not taken and not looked:
             self.look()
         return taken or self._descend()
@@ -444,9 +453,11 @@ class FaceSolver:
         for way in (own.p, own.r):
             size, Fw = largest(qp.coarse.comm, way), qp.F(way)
             curvature, square = qp.dot((way, Fw), (way, way))
-            if size == 0.0 or own.seen(curvature, square):
+            if size == 0.0 or curvature > given.rounding * own.norm * square:
                 continue
             way, Fw = self._unseen(way, Fw)
+            if own.seen(*qp.dot((way, Fw), (way, way))):
+                continue
             # to the first bound, maybe infinite; rounding ends no way
             small = given.rounding * largest(qp.coarse.comm, way)
             moves = (self._status != Status.SLIP) & (np.abs(way) > small)
