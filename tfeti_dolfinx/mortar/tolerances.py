@@ -17,7 +17,7 @@ class SearchTolerances:
     # edge of the secondary side, elsewhere by less than this share of them, count by a power of
     # what they lack: a side that bulges by 10° towards what its edge meets counts a thousandth, by
     # 30° a sixteenth
-    aslant: float = 0.6
+    aslant: float = 0.5
     aside: float = 4.0
     # how much farther a normal is turned beside a plane of symmetry than on it, where the surface
     # bends towards it: twice on an arc of equal facets, 1 on a plane that meets it at a slant
