@@ -12,7 +12,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import Exchange, any_rank, box_over_ranks, count_over
 from tfeti_dolfinx.errors import InputError
@@ -257,18 +257,31 @@ def apart_at_edges(facets: Facets, dofs: TornDofs, across: Array | None) -> tupl
 def shares_at_edges(facets: Facets, dofs: TornDofs, towards: Array, across: Array | None) -> Array:
     """Return how much facets beside edges count, by how they face a shape. Collective.
 
-    That is over the one that does so most, as of a pair's: a side that stands on a plane bears
-    nothing. ``towards`` has normals into the shape at the vertices, shape ``(n v, gdim)``.
+    A side that stands on a plane bears nothing. ``towards`` has normals into the shape at the
+    vertices, shape ``(n v, gdim)``.
     """
-    groups, corners = facets.vertices.ravel(), facets.vertices.shape[1]
-    if dofs.bs == 1 or not any_rank(dofs.comm, edge := edges_at_rest(facets, dofs, across)):
+    if dofs.bs == 1:
         return np.ones(len(facets))
-    cosine = np.sum(np.repeat(facets.normal, corners, axis=0) * towards, axis=1)
-    cosine = np.maximum(cosine, SEARCH.turned)
-    most = dofs.reduce_on_owners(groups, cosine, np.maximum)
-    most, sharp = dofs.lookup(groups, most, edge)
-    counts = np.where(sharp, cosine / most, 1.0) ** SEARCH.aside
-    return counts.reshape(-1, corners).min(axis=1)
+    vertices, edges = facets.vertices.reshape(-1, 1), edges_at_rest(facets, dofs, across)
+    cosine = np.einsum("ng,nvg->nv", facets.normal, towards.reshape(facets.corners.shape)).ravel()
+    cosine, at = np.maximum(cosine, SEARCH.turned), np.arange(len(vertices))
+    seen = facing_shares(dofs, vertices, at, cosine, edges, SEARCH.turned)
+    return seen.reshape(facets.vertices.shape).min(axis=1)
+
+
+def facing_shares(
+    dofs: TornDofs, vertices: Array, facet: Array, cosine: Array, edges: Array, aslant: float
+) -> Array:
+    """Return how much points of facets count, by how they face what they meet. Collective.
+
+    That is over what those at the same ``vertices``, shape ``(n, v)``, do most: all of it where one
+    is at ``edges``, else ``aslant`` of it. Points have a facet and a cosine, shape ``(m,)``.
+    """
+    of_points = np.repeat(cosine, vertices.shape[1])
+    most = dofs.reduce_on_owners(vertices[facet].ravel(), of_points, np.maximum)
+    most, sharp = (x.reshape(vertices.shape) for x in dofs.lookup(vertices.ravel(), most, edges))
+    enough = np.where(sharp.any(axis=1), 1.0, aslant) * most.max(axis=1, initial=0.0)
+    return np.minimum(quotient(cosine, enough[facet]), 1.0) ** SEARCH.aside
 
 
 def with_images(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from tfeti_dolfinx.common.arrays import Array, quotient
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange, any_rank
 from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -20,6 +20,7 @@ from tfeti_dolfinx.mortar.facets import (
     Facets,
     densities,
     facet_kind,
+    facing_shares,
     points,
     reference_points,
     unit,
@@ -243,10 +244,7 @@ def met_at_edges(
     # 1. facets count as they face each other, beside those at the same vertices that do so most
     hats, vertices, s = facet_kind(dofs).hats, secondary.vertices, at.secondary
     cosine = np.maximum(-np.sum(secondary.normal[s] * primary.normal[at.primary], axis=1), 0.0)
-    most = dofs.reduce_on_owners(vertices[s].ravel(), np.repeat(cosine, hats.size), np.maximum)
-    most, sharp = (x.reshape(vertices.shape) for x in dofs.lookup(vertices.ravel(), most, edge))
-    enough = np.where(sharp.any(axis=1), 1.0, SEARCH.aslant) * most.max(axis=1, initial=0.0)
-    seen = np.minimum(quotient(cosine, enough[s]), 1.0) ** SEARCH.aside
+    seen = facing_shares(dofs, vertices, s, cosine, edge, SEARCH.aslant)
     segments = replace(segments, weight=segments.weight * seen)
     # 2. the mean of what an edge meets is its normal
     share = segments.weight[:, None] * hats.values(at.xi)
