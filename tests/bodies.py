@@ -131,15 +131,9 @@ def held(d, *sides):
     """Conditions on the sides named: no normal displacement, or in a pair with a side its value."""
     gdim = d.mesh.geometry.dim
     axis_of = {"front": 1, "back": 1, "bottom": gdim - 1, "top": gdim - 1}  # others: 0
-
-    def bcs(V):
-        made = []
-        for given in sides:
-            side, value = given if isinstance(given, tuple) else (given, 0.0)
-            made.append(roller(V, axis_of.get(side.split()[-1], 0), d.facets(side), value))
-        return made
-
-    return bcs
+    pairs = [given if isinstance(given, tuple) else (given, 0.0) for given in sides]
+    of = [(axis_of.get(side.split()[-1], 0), d.facets(side), value) for side, value in pairs]
+    return lambda V: [roller(V, *given) for given in of]
 
 
 def clamped(d, *sides):

@@ -20,7 +20,7 @@ from tfeti_dolfinx.mesh.partition import UNKNOWNS
 from tfeti_dolfinx.mortar.tolerances import SearchTolerances
 
 HALVINGS = inspect.signature(tfeti.LoadSteps).parameters["max_halvings"].default
-CREASE = np.degrees(np.arccos(SearchTolerances.crease))
+EDGE = 2.0 * np.degrees(np.arccos(SearchTolerances.edge))
 TURNS, FLAT = WarningLimits.turns, 2 * WarningLimits.flat
 PETSC = PETSc.Sys.getVersion()
 LENGTHS, PRESSURES = zip(*UNITS[1:], strict=True)
@@ -74,7 +74,7 @@ OF_CODE_AND_TABLES = [
     ("docs/guide/hard", r"for strain: (\S+) % at (\S+) ", [100 * TURNS**2 / 2, TURNS]),
     ("docs/guide/hard", r"more than about (\d+): forces", [FLAT]),
     ("docs/guide/mesh", r"From about 1 : (\d+) on", [FLAT]),
-    ("docs/two_bodies", r"more than some (\d+) degrees", [pytest.approx(CREASE, abs=2.0)]),
+    ("docs/two_bodies", r"more than some (\d+) degrees", [pytest.approx(EDGE, abs=2.0)]),
     ("docs/two_bodies", r"elements of size 3 lie (\S+) off", [SAG]),
     ("docs/developers/stability", r"for strain: (\S+) % at (\S+) ", [100 * TURNS**2 / 2, TURNS]),
     (NOTES_ON_ERRORS, r"at most (\d+) times it", ABOVE),

@@ -7,6 +7,7 @@ import pytest
 from bodies import (
     TO_ROUNDING,
     boxes,
+    clamped,
     dofs_on,
     gathered,
     held,
@@ -18,7 +19,7 @@ from bodies import (
 )
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, decomposed, problem, roller, solved
+from scenes import decomposed, problem, roller, solved
 
 import tfeti_dolfinx as tfeti
 from meshes.cylinder_on_block import build
@@ -73,12 +74,7 @@ def disc_on_block(comm, order, pushed=0.02):
         with element_options(ElementOrder=order):
             model = build(1.0, 2.0, 0.25, 10.0)
     d = tfeti.read_gmsh(model, comm, 4)
-
-    def bcs(V):
-        down = clamp(V, d.facets("load"), np.array([0.0, -pushed]))
-        return [down, clamp(V, d.facets("bottom"))]
-
-    return d, bcs
+    return d, clamped(d, ("load", np.array([0.0, -pushed])), "bottom")
 
 
 @pytest.mark.parametrize(("order", "sides"), [(1, ("top", "arc")), (2, ("arc", "top"))])
@@ -109,7 +105,7 @@ def test_facets_of_second_order_touch_without_overlap(comm):
 
 @pytest.mark.parametrize("order", [("lower", "upper"), ("upper", "lower")])
 @pytest.mark.parametrize("degree", [1, 2])
-def test_whole_boundaries_press_as_their_faces_alone(order, degree, caplog):
+def test_whole_boundaries_press_as_their_faces_alone(order, degree):
     """Of a quarter of two cubes on a plane, apart at first, cuts and sides bear nothing."""
     low, high = ((0.0, 0.0, -1.0), (1.0, 1.0, 0.0)), ((0.0, 0.0, 0.05), (1.0, 1.0, 1.0))
     parts = [("lower", *low, (2, 2, 2)), ("upper", *high, (3, 3, 2))]
@@ -119,15 +115,25 @@ def test_whole_boundaries_press_as_their_faces_alone(order, degree, caplog):
     d = decomposed_boxes(parts, 4, skins, "hexahedron")
     cuts = [d.locate_facets(lambda x, k=k: np.isclose(x[k], 0.0)) for k in (0, 1)]
     floor = tfeti.Obstacle("lower", tfeti.Plane((0, 0, -1.02), normal=(0, 0, 1)))
+    bcs, pairs = lambda V: [roller(V, *cut) for cut in enumerate(cuts)], [sided(*order), floor]
+    p = solved(two_body_problem(d, pressed(d), bcs, pairs, degree, rtol=1e-10))
+    pressure = np.append(*(gathered(p.solution.contact(i).pressure) for i in (0, 1)))
+    assert np.allclose(pressure[pressure > 0.0], 0.1, rtol=1e-7)
+    assert p.report.warnings == []
 
-    def bcs(V):
-        return [roller(V, k, facets) for k, facets in enumerate(cuts)]
 
-    p = solved(two_body_problem(d, pressed(d), bcs, [sided(*order), floor], degree, rtol=1e-10))
-    for contact in (0, 1):
-        pressure = gathered(p.solution.contact(contact).pressure)
-        assert np.allclose(pressure[pressure > 0.0], 0.1, rtol=1e-7)
-    assert ("has edges" in caplog.text) == (d.comm.rank == 0)
+@pytest.mark.parametrize("sides", [["skin"], ["block bottom", "block left"]])
+def test_an_edge_in_a_corner_needs_a_pair_for_each_side(sides):
+    """A block slides down a wall: as one surface its edge is not stopped by the floor."""
+    parts = [("block", (0.0, 0.0), (1.0, 1.0), (2, 2)), ("wall", (-1.0, 0.0), (0.0, 1.0), (2, 3))]
+    groups = [("skin", ["block bottom", "block left"]), ("corner", ["floor top", "wall right"])]
+    d = decomposed_boxes(
+        [*parts, flat("floor", -1.0, 0.0, 3)], 3, groups if len(sides) == 1 else ()
+    )
+    pairs = map(sided, sides, ["corner"] if len(sides) == 1 else ["floor top", "wall right"])
+    bcs = clamped(d, ("block top", np.array([0.0, -0.01])), "wall left", "floor bottom")
+    p = solved(two_body_problem(d, no_load, bcs, list(pairs)))
+    assert ["is in a corner" in text for text in p.report.warnings] == [True] * (2 - len(sides))
 
 
 def test_options_that_did_not_reach_petsc(monkeypatch):

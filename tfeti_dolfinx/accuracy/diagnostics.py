@@ -13,8 +13,9 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.compat import geometry_degree, geometry_dofmap
-from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest
+from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest, summed
 from tfeti_dolfinx.contact.partner import GEOMETRY
+from tfeti_dolfinx.contact.records import relative_displacement
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_entities, facet_points
@@ -74,6 +75,8 @@ class WarningLimits:
     stands_out: float = 2.0
     # a gap below 0 that a mesh has, over the largest displacement: forces follow from it then
     overlaps: float = 0.1
+    # of the largest displacement: how far an edge in a corner may move there, or be apart at first
+    corners: float = 0.01
     listed: int = 3  # bodies that a sentence names
 
 
@@ -108,6 +111,7 @@ class Diagnostics:
             *self._rounding(dual, u, energy, rtol),
             *([] if solution.finite else self._turned(u, dual.subdomains)),
             *self._facets(solution, dual.subdomains),
+            *_corners(solution),
             *self._lasting,
             *of_estimates(outcome),
         ]
@@ -305,6 +309,27 @@ def _loose(outcome: Outcome) -> Iterator[str]:
         )
     if (rest := len(weak) - LIMITS.listed) > 0:
         yield f"{rest} more motions are weakly constrained by active contacts"
+
+
+def _corners(solution: Solution) -> Iterator[str]:
+    """Pairs with edges in corners, whose nodes have one condition for two sides. Collective.
+
+    It is as good as two where a node has met both sides from the start, and moves along neither.
+    """
+    records, comm = solution.gluing.records, solution.dofs.comm
+    if not any_rank(comm, records.corner):
+        return
+    v = relative_displacement(records, solution.dofs, solution.u)
+    moved = np.maximum(np.linalg.norm(v, axis=1), np.abs(records.gap))
+    far = records.corner & records.within_reach
+    far &= moved > LIMITS.corners * largest(comm, solution.u)
+    counts = np.bincount(records.contact[far], minlength=len(solution.contacts))
+    for i in np.flatnonzero(summed(comm, counts)):
+        name, (a, b) = solution.contacts[i].name, solution.contacts[i].surfaces
+        yield (
+            f"{name}: an edge of {a!r} is in a corner of {b!r}, and is stopped in one direction "
+            "alone; expected a pair for each side of the corner, with names of their own"
+        )
 
 
 def notes_of(outcome: Outcome, solution: Solution) -> list[str]:

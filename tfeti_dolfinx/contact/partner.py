@@ -364,7 +364,6 @@ LITTLE = (
     "%s: %r covers so little of the facets of the secondary side %r that nodes may lack "
     "conditions; expected secondary=%r"
 )
-EDGES = "%s: %r has edges; one in a corner of the other side needs a pair for each of its own sides"
 
 log = logging.getLogger(__name__)
 
@@ -455,10 +454,6 @@ class Contact(ContactPartner):
         worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
         if worse and not auto and dofs.comm.rank == 0:
             log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
-        facets = sides[0].facets
-        cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
-        if count_over(dofs.comm, cosine < SEARCH.crease) and dofs.comm.rank == 0:
-            log.warning(EDGES, self.name, settled.a)
         return settled, found
 
     def records(
@@ -522,7 +517,7 @@ class Contact(ContactPartner):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height, moved)
         own, where = sides[0], (segments, secondary, primary, across)
-        normals, secondary, segments = met_at_edges(dofs, edges, own.normals, *where)
+        normals, corner, secondary, segments = met_at_edges(dofs, edges, own.normals, *where)
         with raised_on_all_ranks(comm):
             integrals = integrate(kind, secondary, primary, segments, moved, curved)
         averted = any_rank(comm, segments.averted)
@@ -532,6 +527,7 @@ class Contact(ContactPartner):
                 "outward normals that oppose each other"
             )
         found = conditions(dofs, contact, replace(own, normals=normals), integrals, sides[1])
+        found = replace(found, corner=corner[found.group])
         return self._with_gaps_and_friction(dofs, found, reach, depth)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:

@@ -31,7 +31,7 @@ class Friction(IntEnum):
 
 # tables of whole numbers, and of flags
 WHOLE = ("contact", "group", "condition", "entry_group", "friction", "held", "neighbour")
-FLAGS = ("conforms", "within_reach")
+FLAGS = ("conforms", "corner", "within_reach")
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,8 @@ class ContactRecords:
     # whether the facets change the gap by more than that of the smooth surfaces varies from node to
     # node, shape (n,)
     conforms: Array
+    # whether the node is at an edge that meets two sides at once, shape (n,)
+    corner: Array
     # integral ∫φ_i of the node's hat over the contact surface, ∫rφ_i of axisymmetric models, of a
     # pair over what the other side covers of it, shape (n,)
     area: Array
@@ -225,6 +227,7 @@ def conditions(
         geometric_gap=gap,
         curved_gap=curved_gap,
         conforms=np.abs(curved_gap - gap) > np.maximum(spread, rounding),
+        corner=np.zeros(len(chosen), dtype=bool),
         area=areas,
         covered=areas / whole[chosen],
         within_reach=np.ones(len(chosen), dtype=bool),

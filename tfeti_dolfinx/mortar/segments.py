@@ -230,32 +230,34 @@ def met_at_edges(
     secondary: Facets,
     primary: Facets,
     across: Array | None,
-) -> tuple[Array, Facets, Segments]:
-    """Return normals, secondary facets and segments of surfaces with edges. Collective.
+) -> tuple[Array, Array, Facets, Segments]:
+    """Return normals, corners, secondary facets and segments of surfaces with edges. Collective.
 
     The mean of an edge's faces is no direction in which an edge that slides is stopped, and a side
     that stands on what the other body has there does not bear. Owned groups have flags ``edges`` of
     both surfaces, as at rest, and ``normals`` of the secondary one; on planes of symmetry, by flags
-    ``across`` of components, these stay in them.
+    ``across`` of components, these stay in them. Corners are flags of edges that meet two sides.
     """
     at, edge = segments.points, edges[0]
     if not any_rank(dofs.comm, bool(np.any(edges))):
-        return normals, secondary, segments
+        return normals, edge, secondary, segments
     # 1. facets count as they face each other, beside those at the same vertices that do so most
     hats, vertices, s = facet_kind(dofs).hats, secondary.vertices, at.secondary
     cosine = np.maximum(-np.sum(secondary.normal[s] * primary.normal[at.primary], axis=1), 0.0)
     seen = facing_shares(dofs, vertices, s, cosine, edge, SEARCH.aslant)
     segments = replace(segments, weight=segments.weight * seen)
-    # 2. the mean of what an edge meets is its normal
+    # 2. the mean of what an edge meets is its normal, unless that turns as at an edge
     share = segments.weight[:, None] * hats.values(at.xi)
     faced = -points(hats, primary.vertex_normals[at.primary], at.eta)
-    faced = (share[:, :, None] * faced[:, None]).reshape(-1, dofs.bs)
-    faced = dofs.reduce_on_owners(vertices[s].ravel(), faced)
+    faced = np.column_stack((faced, np.ones(len(faced))))
+    faced = (share[:, :, None] * faced[:, None]).reshape(-1, dofs.bs + 1)
+    *_, total = (sums := dofs.reduce_on_owners(vertices[s].ravel(), faced)).T
+    corner = edge & (np.linalg.norm(faced := sums[:, :-1], axis=1) < SEARCH.edge * total)
     faced = unit(faced if across is None else np.where(across, 0.0, faced))
     normals = np.where(edge[:, None] & np.any(faced != 0.0, axis=1, keepdims=True), faced, normals)
     (turned,) = dofs.lookup(vertices.ravel(), normals)
     turned = turned.reshape(secondary.corners.shape)
-    return normals, replace(secondary, vertex_normals=turned), segments
+    return normals, corner, replace(secondary, vertex_normals=turned), segments
 
 
 @dataclass(frozen=True)

@@ -65,8 +65,6 @@ class SearchTolerances:
     # of the longest side of a triangle of a tool: what is less high has sides whose determinant, a
     # square, is rounding, and so is the nearest point
     thin: float = 1e-7
-    # cosine of about 40°: facets that make more with the averaged normal are at an edge
-    crease: float = 0.75
     # ratio up to which meshes are of one size: an irrational number, so that rounding decides
     # nowhere between counts of equal facets
     same_size: float = 2 ** (1 / 6)
