@@ -45,11 +45,11 @@ def shaped(cell, n_lower, n_upper, lower, upper, across=(0.0, 1.0)):
 
 def bent(cell, n_lower, n_upper, lower, upper, at=np.array, gap=0.0):
     """Sides bent to c|x|², so far apart at x = 0."""
-
-    def side(c, start=0.0):
-        return lambda x: start + c * np.sum(at(x) ** 2, axis=1)
-
-    return shaped(cell, n_lower, n_upper, side(lower), side(upper, gap))
+    ends = [
+        lambda x, c=c: c[1] + c[0] * np.sum(at(x) ** 2, axis=1)
+        for c in ((lower, 0.0), (upper, gap))
+    ]
+    return shaped(cell, n_lower, n_upper, *ends)
 
 
 @pytest.mark.parametrize("sides", ORDERS)
@@ -64,9 +64,8 @@ def bent(cell, n_lower, n_upper, lower, upper, at=np.array, gap=0.0):
 )
 def test_bodies_that_only_touch_have_no_overlap(cell, n, curvatures, sides):
     """Flat, convex and concave sides; a mean with ψ_i, negative somewhere, must not say more."""
-    d = bent(cell, *n, *curvatures)
-    gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_on(d)).gap)
-    assert gaps.min() > -1e-12
+    gaps = searched([sided(*sides, reach=0.5)], dofs_on(bent(cell, *n, *curvatures))).gap
+    assert gathered(gaps).min() > -1e-12
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e3])
@@ -74,9 +73,8 @@ def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
     """Turned bodies that touch; one that is 1e-12 of their size stays."""
     for gap in (0.0, 1e-12):
         d = stacked("triangle", 3, 4, 4, gap=gap)
-        x, y = d.mesh.geometry.x.T[:2].copy()
-        d.mesh.geometry.x[:, 0] = size * (np.cos(0.3) * x - np.sin(0.3) * y)
-        d.mesh.geometry.x[:, 1] = size * (np.sin(0.3) * x + np.cos(0.3) * y)
+        turn = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
+        d.mesh.geometry.x[:, :2] = size * d.mesh.geometry.x[:, :2] @ turn
         for sides in ORDERS:
             gaps = gathered(searched([sided(*sides)], dofs_on(d)).gap)
             assert np.allclose((gaps.min(), gaps.max()), gap * size, rtol=1e-2, atol=0.0)
@@ -125,9 +123,7 @@ def test_a_half_and_a_quarter_have_the_answer_of_the_whole(cell, degree, gap, si
     planes = [f"{body} {side}" for body in ("lower", "upper") for side in ("left", "front")[:last]]
 
     def answer(parts):
-        def at(x):
-            return 0.5 * x + 0.25 if parts == 1 else x
-
+        at = np.array if parts == 2 else (lambda x: 0.5 * x + 0.25)
         d = bent(cell, 3 * parts, 4 * parts, 0.9, 1.0, at, 0.01)
         x = d.mesh.geometry.x  # nodes are off a plane by what files round
         x[:, :last] = at(x[:, :last] - 0.5) + 1e-7 * np.sin(9.0 * x[:, last : last + 1])
@@ -181,6 +177,15 @@ def test_slivers_beyond_a_rim_say_little_of_gaps_in_finite_strain():
     assert np.isclose(p.solution.contact().resultant.force[2], -0.00855, rtol=0.15)
 
 
+def test_a_punch_less_wide_than_its_overlap_presses_in_finite_strain():
+    """Facets of the block, covered in part, lie deeper in it than that part is wide."""
+    flat = [lambda x, z=z: np.full(len(x), z) for z in (0.0, -0.12)]
+    d = shaped("quadrilateral", 3, 1, *flat, across=(0.45, 0.55))
+    bcs = clamped(d, "lower bottom", "upper top")
+    ends = [two_bodies(True, d, bcs, sided(*s, reach=0.4)).solution.contact() for s in ORDERS]
+    assert np.allclose([np.abs(end.resultant.force[1]) for end in ends], 0.01187, rtol=0.01)
+
+
 def against_lame(p):
     """Solve; relative error of the mean pressure, and of the pressure in L²."""
     p.solve()
@@ -211,15 +216,13 @@ def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
 
 def test_free_rings_are_solved():
     """Rows hold the turn of one in the other by the errors of their normals, or not at all."""
-    mesh = {"subdomains": 8, "overlap": OVERLAP}
-    p = ring_problem((24, 32), 2, mesh, 0.0, secondary="hub")
-    mean, _ = against_lame(p)
+    p = ring_problem((24, 32), 2, {"subdomains": 8, "overlap": OVERLAP}, 0.0, secondary="hub")
+    assert abs(against_lame(p)[0]) <= 0.011
     assert p.report.converged_reason == "CONVERGED_RTOL"
     assert p.report.residuals["displacement_error"] <= 1e-8
     assert p.report.residuals["penetration"] <= 1e-8 * OVERLAP
     assert p.report.free_modes >= 3
     assert "rotation in the plane" in {motion["mode"] for motion in p.report.nearly_free}
-    assert abs(mean) <= 0.011
 
 
 def test_the_gap_of_an_obstacle_is_what_is_given():
@@ -236,8 +239,7 @@ def test_the_gap_of_an_obstacle_is_what_is_given():
 
 def test_the_gap_of_a_pair_is_what_is_given():
     """Also where the meshes overlap by more than the reach."""
-    d = stacked("triangle", 3, 4, 4, gap=-0.1)
-    dofs = dofs_on(d)
+    dofs = dofs_on(stacked("triangle", 3, 4, 4, gap=-0.1))
     records = searched([sided(*ORDERS[0], gap=lambda x: x[0] - 0.5)], dofs)
     assert np.allclose(records.gap, group_points(dofs)[records.group][:, 0] - 0.5)
     assert MPI.COMM_WORLD.allreduce(len(records)) == 5

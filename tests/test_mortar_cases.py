@@ -122,18 +122,16 @@ def test_whole_boundaries_press_as_their_faces_alone(order, degree):
     assert p.report.warnings == []
 
 
-@pytest.mark.parametrize("sides", [["skin"], ["block bottom", "block left"]])
-def test_an_edge_in_a_corner_needs_a_pair_for_each_side(sides):
+@pytest.mark.parametrize("one", [True, False])
+def test_an_edge_in_a_corner_needs_a_pair_for_each_side(one):
     """A block slides down a wall: as one surface its edge is not stopped by the floor."""
     parts = [("block", (0.0, 0.0), (1.0, 1.0), (2, 2)), ("wall", (-1.0, 0.0), (0.0, 1.0), (2, 3))]
-    groups = [("skin", ["block bottom", "block left"]), ("corner", ["floor top", "wall right"])]
-    d = decomposed_boxes(
-        [*parts, flat("floor", -1.0, 0.0, 3)], 3, groups if len(sides) == 1 else ()
-    )
-    pairs = map(sided, sides, ["corner"] if len(sides) == 1 else ["floor top", "wall right"])
+    sides = {"skin": ["block bottom", "block left"], "corner": ["floor top", "wall right"]}
+    d = decomposed_boxes([*parts, flat("floor", -1.0, 0.0, 3)], 3, sides.items() if one else ())
+    pairs = [sided(*pair) for pair in ([sides] if one else zip(*sides.values(), strict=True))]
     bcs = clamped(d, ("block top", np.array([0.0, -0.01])), "wall left", "floor bottom")
-    p = solved(two_body_problem(d, no_load, bcs, list(pairs)))
-    assert ["is in a corner" in text for text in p.report.warnings] == [True] * (2 - len(sides))
+    p = solved(two_body_problem(d, no_load, bcs, pairs))
+    assert ["is in a corner" in text for text in p.report.warnings] == [True] * one
 
 
 def test_options_that_did_not_reach_petsc(monkeypatch):

@@ -511,11 +511,14 @@ class Contact(ContactPartner):
         moved, curved = dofs.nodes is not None, self.gap == CURVED
         distance = max(height := SEARCH.seen * reach, deep := SEARCH.seen * depth)
         apart, edges = zip(*(apart_at_edges(s.facets, dofs, across) for s in sides), strict=True)
+        aside = False
+        if dofs.nodes is not None:  # faces without edges press as they are meshed, however narrow
+            aside = any_rank(comm, bool(np.any(edges) or np.any(np.diff(dofs.nodes, axis=0))))
         images = with_images(apart[1], dofs, across)
         secondary, primary = rendezvous(apart[0], images, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
-            segments = find_segments(kind, secondary, primary, pairs, deep, height, moved)
+            segments = find_segments(kind, secondary, primary, pairs, deep, height, aside)
         own, where = sides[0], (segments, secondary, primary, across)
         normals, corner, secondary, segments = met_at_edges(dofs, edges, own.normals, *where)
         with raised_on_all_ranks(comm):

@@ -182,13 +182,13 @@ def find_segments(
     pairs: tuple[Array, Array],
     depth: float,
     height: float,
-    moved: bool,
+    aside: bool,
 ) -> Segments:
     """Clip pairs of facets on the secondary facets' averaged normal planes.
 
     Facets that overlap by more than the depth along the normal, or are farther apart than the
     height, do not meet; these lengths are exceeded by the facets' own sizes, so that no facet
-    within them is covered in part only. Those that have ``moved`` may be reached from the side.
+    within them is covered in part only. They may be reached from the side, ``aside``, or not.
     """
     planes = _Planes(kind, secondary, primary)
     # 1. common parts of facets that are neither too far nor seen from the side
@@ -204,7 +204,7 @@ def find_segments(
     found = found[planes.first_layer(found)]
     # 4. a body reaches into another from the side where it lies deeper in it than it is wide there
     share = np.bincount(found.s, found.parts.size, minlength=len(secondary)) / planes.size
-    partly = moved & (share < 1.0 - SEARCH.uncovered)
+    partly = aside & (share < 1.0 - SEARCH.uncovered)
     width = np.where(partly, 2.0 * share * secondary.radius, np.inf)
     found = found[found.distance >= -width[found.s]]
     # 5. quadrature on the planes, and the points of both facets over it
