@@ -273,8 +273,9 @@ class Solution:
     def traction(self) -> fem.Function:
         """Contact traction on the surfaces of both sides, a vector; 0 elsewhere.
 
-        Its moments with the shape functions of degree 1 are those of the nodal contact forces,
-        so action and reaction of two sides have the same resultant.
+        It is a force over areas of the mesh as it was, in finite strain, too: its moments with
+        the shape functions of degree 1 are those of the nodal contact forces, so action and
+        reaction of two sides have the same resultant.
         """
         surfaces = [name for contact in self.contacts for name in contact.surfaces]
         values, area = vertex_tractions(self.nodal_forces, self.dofs, surfaces, self.thickness)
@@ -323,7 +324,8 @@ class Solution:
         total = sum_rows(records.group, force, dofs.num_groups)
         area = sum_rows(records.group, self.area, dofs.num_groups)
         surfaces = [contact.surfaces[0] for contact in self.contacts]
-        whole = hat_integrals(dofs, surfaces, self.thickness)
+        u = self.displacement if self.finite else None
+        whole = hat_integrals(dofs, surfaces, self.thickness, u)
         return quotient(total, np.minimum(area, whole)[:, None])
 
     # ---------------------------------------- contacts, conditions, rigid bodies

@@ -430,11 +430,17 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
     return facets
 
 
-def hat_integrals(dofs: TornDofs, names: Sequence[str | int], thickness: Any = 1.0) -> Array:
+def hat_integrals(
+    dofs: TornDofs,
+    names: Sequence[str | int],
+    thickness: Any = 1.0,
+    u: fem.Function | None = None,
+) -> Array:
     """Return ∫φ_i of the hats of degree 1 over the union of surfaces, by names or tags. Collective.
 
     They are weighted by the thickness, a number or a scalar in UFL. One integral per owned group,
-    zero off the surfaces and off the vertices, shape ``(g,)``.
+    zero off the surfaces and off the vertices, shape ``(g,)``. With a displacement the surfaces
+    are where it brings the points of the mesh.
     """
     if not names:
         return np.zeros(dofs.num_groups)
@@ -442,6 +448,14 @@ def hat_integrals(dofs: TornDofs, names: Sequence[str | int], thickness: Any = 1
     tags = tuple(sorted({decomposition.surface(name) for name in names}))
     ds = ufl.Measure("ds", domain=W.mesh, subdomain_data=decomposition.facet_tags)
     weight = fem.Constant(W.mesh, thickness) if isinstance(thickness, float) else thickness
+    if u is not None:
+        element = W.mesh.ufl_domain().ufl_coordinate_element()
+        moved = fem.Function(fem.functionspace(W.mesh, element))
+        moved.interpolate(u)
+        F = ufl.Identity(len(u)) + ufl.grad(moved)
+        normal = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(W.mesh)
+        round_axis = moved[0] / ufl.SpatialCoordinate(W.mesh)[0] if dofs.axisymmetric else 0.0
+        weight *= ufl.sqrt(ufl.inner(normal, normal)) * (1.0 + round_axis)
     form = fem.form(weight * ufl.TestFunction(W) * ds(tags))
     per_node = np.zeros(dofs.num_nodes)
     per_node[node] = fem.assemble_vector(form).array

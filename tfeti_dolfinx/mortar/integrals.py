@@ -240,8 +240,6 @@ def _above_lowest(
     low -= SEARCH.below * secondary.radius[dual.facet, None]
     short = np.where(dual.covered > 0.0, np.maximum(low - mean, 0.0), 0.0)
     part = np.minimum(quotient(short, of_hats - mean).max(axis=1, initial=0.0), 1.0)
-    # continuous in u where a facet comes to be covered wholly
-    part *= np.clip((dual.share - SEARCH.extrapolated) / (1.0 - SEARCH.extrapolated), 0.0, 1.0)
     part = part[dual.place, None]
     return replace(dual, weighted=(1.0 - part) * dual.weighted + part * hats)
 

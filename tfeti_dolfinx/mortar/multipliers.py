@@ -35,7 +35,6 @@ class FacetMultipliers:
     place: Array  # place in `facet` of each point's facet, shape (m,)
     weighted: Array  # weight times ψ_i at each point, shape (m, v)
     covered: Array  # ∫φ_i over the part that the points cover, shape (f, v)
-    share: Array  # of the facet's area that is covered, shape (f,)
     # of ∫φ_d of a vertex d whose multiplier is a point: shares of neighbours k, shape (f, d, k)
     shares: Array
 
@@ -115,7 +114,7 @@ def facet_multipliers(
     dual[np.any(near[facets], axis=1) & ~hardly] = np.eye(kind.hats.size)
     psi = np.einsum("mij,mj->mi", dual[place], hats)
     shares = np.zeros(mass.shape)
-    return FacetMultipliers(facets, place, weight[:, None] * psi, covered, share, shares)
+    return FacetMultipliers(facets, place, weight[:, None] * psi, covered, shares)
 
 
 # --- Vertices that conditions hold ------------------------------------------------------------
