@@ -21,7 +21,7 @@ from tfeti_dolfinx.feti.operator import (
     mean_stiffness,
     scaled_rows,
 )
-from tfeti_dolfinx.feti.preconditioner import Deflation, FacePreconditioners, MakeDeflation
+from tfeti_dolfinx.feti.preconditioner import Deflation, FacePreconditioner, MakeDeflation
 from tfeti_dolfinx.feti.solvability import check_solvable
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, KnownProduct
@@ -145,11 +145,11 @@ class Dual:
         names = body_names, mode_names
         self.coarse = CoarseSpace(constraints, subdomains, names, sigma, prefix)
         self.deflation: Deflation | None = None
-        self._on_faces: FacePreconditioners | None = None
+        self._on_faces: FacePreconditioner | None = None
         if self.preconditioner is not None:
             if deflation is not None:
                 self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
-            self._on_faces = FacePreconditioners(
+            self._on_faces = FacePreconditioner(
                 self.preconditioner,
                 constraints,
                 subdomains.diagonal,

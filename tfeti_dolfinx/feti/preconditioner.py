@@ -50,6 +50,23 @@ PARAMETERS = SmoothingParameters()
 # --- Preconditioner on a face -----------------------------------------------------------------
 
 
+class Deflation(Protocol):
+    """A coarse space of a preconditioner on faces."""
+
+    count: int  # number of its motions, of all subdomains
+    factors: FaceFactors  # makes the factors of faces, and counts them
+
+    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
+        """Return M_f, which is taken over, with these motions. Collective."""
+
+    def destroy(self) -> None:
+        """Free what belongs to it. Collective."""
+
+
+# from B, the natural coarse space, weights and a prefix of options
+MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, str], Deflation]
+
+
 class FacePreconditioner:
     """M_f = W⁻¹B_f D⁻¹ p(KH) A p(HK) D⁻¹B_fᵀ W⁻¹, W = B_f D⁻¹B_fᵀ, f the rows of a face.
 
@@ -72,7 +89,8 @@ class FacePreconditioner:
     W_κ = W + κσ. With springs a displacement is followed by ρ, of which κσρ is how far they move.
     ``whole`` is B D⁻¹ A D⁻¹Bᵀ on all rows, A the Schur complements, or the stiffness on the trace;
     with the metric of smoothing, or without. ``diagonal`` is that of K on the local trace unknowns,
-    the mean at each node. Creation is collective.
+    the mean at each node. M_f of all rows and of the last face are kept. Creation and all methods
+    are collective.
 
     Attributes:
         whole: A, and B D⁻¹ = B_D.
@@ -85,20 +103,28 @@ class FacePreconditioner:
     apply: Callable[[Array, Array], None]
 
     def __init__(
-        self, whole: DualOperator, constraints: Constraints, diagonal: Array, prefix: str
+        self,
+        whole: DualOperator,
+        constraints: Constraints,
+        diagonal: Array,
+        prefix: str,
+        deflation: Deflation | None,
     ) -> None:
-        self.whole, self._prefix, sets = whole, prefix, constraints.sets
-        self._contact = np.concatenate((sets.normals, sets.tangents.ravel()))
+        self.whole, self._deflation, self._prefix = whole, deflation, prefix
+        self._constraints, self._contact = constraints, constraints.sets.contact
+        self._comm = constraints.B.getComm().tompi4py()
         self._gram = _contact_gram(constraints.B, whole.B, self._contact)
         self._size = _diagonal(whole.B, diagonal)
         self.work, self.jumps = whole.B.createVecs()
         self.weights, self.steps = constraints.weights, list[tuple[float, float]]()
         self._metric: Metric | None = None
         self._diagonal = diagonal
+        self._on_all: FaceOperator | None = None
+        self._last: tuple[Face, FaceOperator] | None = None
         self.settle()
 
     def settle(self) -> None:
-        """Follow what the operator on all rows becomes. Collective."""
+        """Follow what the operator on all rows becomes."""
         if isinstance(self.whole, LateDirichlet):
             self.whole.settle()
         if (metric := self.whole.metric) is not self._metric and metric is not None:
@@ -106,8 +132,8 @@ class FacePreconditioner:
             self._smooth_in(metric, self._diagonal)
 
     def _smooth_in(self, metric: Metric, diagonal: Array) -> None:
-        """Choose the steps by a bound of the largest eigenvalue of D⁻¹K. Collective."""
-        comm, self.apply = self.work.getComm().tompi4py(), metric.trace.mult
+        """Choose the steps by a bound of the largest eigenvalue of D⁻¹K."""
+        comm, self.apply = self._comm, metric.trace.mult
         size = bcast_from_root(comm, largest(comm, diagonal / self.weights))
         if metric.near is not None and size > 0.0:
             with raised_on_all_ranks(comm):
@@ -124,17 +150,42 @@ class FacePreconditioner:
         if top > 0.0:  # there are rows
             self.steps = chebyshev(steps, top / part, top)
 
+    def on_all_rows(self) -> Operator:
+        """Return M on all rows: itself where it has no coarse space, and smooths nothing there."""
+        smooths = isinstance(self.whole, LateDirichlet) or self.whole.metric is not None
+        count = 0 if self._deflation is None else self._deflation.count
+        if not (count or (smooths and not any(self._constraints.contact_rows))):
+            return self.whole
+        if self._on_all is None:
+            rows = self._constraints.num_rows
+            self._on_all = self._made(Face(np.ones(rows, dtype=bool), np.full(rows, Status.FREE)))
+        return self._on_all
+
     def on_face(self, face: Face) -> FaceOperator:
-        """M_f on a face. Collective. Raise a FactorError where W_C has no factor."""
-        free, factor = np.zeros_like(face.free), None
+        """Return M_f, that of the last time if it is that face.
+
+        Raise a FactorError where W_C has no factor.
+        """
+        if self._last is not None:
+            known, operator = self._last
+            if not any_rank(self._comm, not face.is_like(known)):
+                return operator
+            self._last = None
+            operator.destroy()
+        self._last = face, self._made(face)
+        return self._last[1]
+
+    def _made(self, face: Face) -> FaceOperator:
+        """Make M_f, with the coarse space if there is one."""
+        free, factor, contact = np.zeros_like(face.free), None, None
         free[self._contact] = face.free[self._contact]
         on_contact = replace(face, free=free)
         along = np.sum(face.tangents**2 * self._size[face.tangent_rows], axis=1)
         size = np.concatenate((self._size[free], along))
         bent = on_contact.bends * size
-        if self._gram is None and not np.any(bent):
-            return _OnFace(self, face)
-        Z_C = on_contact.Z
+        if self._gram is not None or np.any(bent):
+            Z_C = on_contact.Z
+            contact = Z_C, bent, size
         if self._gram is not None:
             # Z_CᵀW_C Z_C, which becomes the factor's
             directions = side_by_side(Z_C[self._contact], self._gram.getComm())
@@ -148,14 +199,16 @@ class FacePreconditioner:
                 factor = ContactFactor(part, self._prefix)
             else:
                 part.destroy()
-        return _OnFace(self, face, (Z_C, bent, size), factor)
+        made = _OnFace(self, face, contact, factor)
+        return made if self._deflation is None else self._deflation.balanced(face, made)
 
     def destroy(self) -> None:
-        """Destroy W_C, not the operator on all rows. Collective."""
-        self.work.destroy()
-        self.jumps.destroy()
-        if self._gram is not None:
-            self._gram.destroy()
+        """Destroy what was made, not the operator on all rows nor the coarse space."""
+        made = (self._last and self._last[1], self._on_all, self.work, self.jumps, self._gram)
+        for item in made:
+            if item is not None:
+                item.destroy()
+        self._on_all = self._last = None  # they know this object
 
 
 class _OnFace:
@@ -169,8 +222,8 @@ class _OnFace:
         self,
         on_all: FacePreconditioner,
         face: Face,
-        contact: tuple[csr_array, Array, Array] | None = None,
-        factor: ContactFactor | None = None,
+        contact: tuple[csr_array, Array, Array] | None,
+        factor: ContactFactor | None,
     ) -> None:
         self._on_all, self._face, self._factor = on_all, face, factor
         self._is_identity, self._bends = contact is None, False
@@ -267,85 +320,6 @@ def _contact_gram(B: PETSc.Mat, B_D: PETSc.Mat, contact: Array) -> PETSc.Mat | N
         gram.destroy()
         return None
     return gram
-
-
-# --- Preconditioners on faces -----------------------------------------------------------------
-
-
-class Deflation(Protocol):
-    """A coarse space of a preconditioner on faces."""
-
-    count: int  # number of its motions, of all subdomains
-    factors: FaceFactors  # makes the factors of faces, and counts them
-
-    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
-        """Return M_f, which is taken over, with these motions. Collective."""
-
-    def destroy(self) -> None:
-        """Free what belongs to it. Collective."""
-
-
-# from B, the natural coarse space, weights and a prefix of options
-MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, str], Deflation]
-
-
-class FacePreconditioners:
-    """M_f of a ``FacePreconditioner`` on one face after the other, with a coarse space if given.
-
-    Those of all rows and of the last face are kept. Creation is not collective, all methods are.
-    """
-
-    def __init__(
-        self,
-        whole: DualOperator,
-        constraints: Constraints,
-        diagonal: Array,
-        prefix: str,
-        deflation: Deflation | None,
-    ) -> None:
-        self._whole, self._constraints, self._deflation = whole, constraints, deflation
-        self._diagonal, self._prefix = diagonal, prefix
-        self._comm = constraints.B.getComm().tompi4py()
-        self._shared: FacePreconditioner | None = None
-        self._on_all: FaceOperator | None = None
-        self._last: tuple[Face, FaceOperator] | None = None
-
-    def on_all_rows(self) -> Operator:
-        """Return M on all rows: itself where it has no coarse space, and smooths nothing there."""
-        smooths = isinstance(self._whole, LateDirichlet) or self._whole.metric is not None
-        count = 0 if self._deflation is None else self._deflation.count
-        if not (count or (smooths and not any(self._constraints.contact_rows))):
-            return self._whole
-        if self._on_all is None:
-            rows = self._constraints.num_rows
-            self._on_all = self._made(Face(np.ones(rows, dtype=bool), np.full(rows, Status.FREE)))
-        return self._on_all
-
-    def on_face(self, face: Face) -> FaceOperator:
-        """Return M_f, that of the last time if it is that face."""
-        if self._last is not None:
-            known, operator = self._last
-            if not any_rank(self._comm, not face.is_like(known)):
-                return operator
-            self._last = None
-            operator.destroy()
-        self._last = face, self._made(face)
-        return self._last[1]
-
-    def _made(self, face: Face) -> FaceOperator:
-        """Make M_f; parts that all faces share are made once."""
-        if self._shared is None:
-            self._shared = FacePreconditioner(
-                self._whole, self._constraints, self._diagonal, self._prefix
-            )
-        made = self._shared.on_face(face)
-        return made if self._deflation is None else self._deflation.balanced(face, made)
-
-    def destroy(self) -> None:
-        """Destroy what was made, not the operator on all rows nor the coarse space."""
-        for item in (self._last and self._last[1], self._on_all, self._shared):
-            if item is not None:
-                item.destroy()
 
 
 # --- Chebyshev steps --------------------------------------------------------------------------
