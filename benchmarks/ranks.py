@@ -119,7 +119,8 @@ def worker(file, subdomains, clusters):
     problem.solve()
     MPI.pickle.__init__(pickle.dumps, pickle.loads)
     held = arrays(problem)
-    dual = problem._system.make({})
+    problem._system.make({})
+    dual = problem.dual
     step = sent_by_steps(dual, sent).tolist()
     own = {"step": step, "pickled": len(pickled), "arrays": held}
     own |= {"motions": dual.coarse.dimension, "factor": dual.coarse.factor._factor.entries}

@@ -7,6 +7,7 @@ from scenes import apart, curved_obstacle, decomposed, grid, problem
 from scipy.sparse import csr_array
 from test_blocks import data, stiffness
 from test_dual import check_operator
+from test_solvability import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import LocalMatrix, parts_of
@@ -23,8 +24,7 @@ def made(d, local_type="auto", contact=True, **options):
     gdim = d.mesh.geometry.dim
     contacts = [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=np.inf)] if contact else []
     p = problem(d, contacts=contacts, tfeti_local_type=local_type, **options)
-    p._system.look_for_changes()
-    return p, p._system.make({}).subdomains
+    return p, dual_of(p).subdomains
 
 
 def random(n):

@@ -270,7 +270,8 @@ class ContactProblem:
     def _solve_rows(self) -> tuple[Solution, float]:
         """Solve with the present rows, from the last solution on; return what may overlap, too."""
         system, seconds, d = self._system, self._seconds, self.decomposition
-        dual, gluing = system.make(seconds), system.gluing
+        system.make(seconds)
+        dual, gluing = system.dual, system.gluing
         now = self.options
         options = replace(system.options, rtol=now.rtol, atol=now.atol, warnings=now.warnings)
         dual.begin_solve(system.begun(), self._negligible(dual.subdomains))
@@ -532,7 +533,8 @@ class ContactProblem:
         system.know_rows((list(state.reach), state.groups(self.dofs)), sides)
         system.look_for_changes()
         system.tools.go_back(state.tools)  # by now laws may have others
-        dual = system.make(self._seconds)
+        system.make(self._seconds)
+        dual = system.dual
         dual.seen, dual.left = max(dual.seen, float(state.norm)), tuple(state.left)
         state = state.on_rows(system.gluing)
         # what conditions prescribed then: by now they may have other values

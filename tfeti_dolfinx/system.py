@@ -246,12 +246,7 @@ class System(Generic[OwnForms]):
         self._secondary = self._secondary if secondary is None else list(secondary)
         self.change("points")
 
-    def make(self, seconds: MutableMapping[str, float]) -> Dual:
-        """Make what is out of date, and return the dual problem; see ``make_up_to``."""
-        self.make_up_to("linear term", seconds)
-        return self.dual
-
-    def make_up_to(self, last: str, seconds: MutableMapping[str, float]) -> None:
+    def make(self, seconds: MutableMapping[str, float], last: str = "linear term") -> None:
         """Make what is out of date up to a stage. After an error its stage stays out of date.
 
         Raise an InputError where Dirichlet values, contacts, stiffness or load do not fit; a

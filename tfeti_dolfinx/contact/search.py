@@ -116,9 +116,8 @@ class ContactSearch:
         ``take_in_overlapping``, as ever. Raise an InputError where a gap does not fit, or that of
         the geometry overlaps too deep; nothing has changed then.
         """
-        contacts = list(self.contacts)
-        for i, gap in gaps.items():
-            contacts[i] = contacts[i].with_gap(gap)
+        given = enumerate(self.contacts)
+        contacts = [c.with_gap(gaps[i]) if i in gaps else c for i, c in given]
         self._take_gaps(contacts, gaps)
         self.contacts = contacts
 

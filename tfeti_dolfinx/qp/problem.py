@@ -269,30 +269,22 @@ def no_monitor(*step: Any) -> None:
     """Say nothing."""
 
 
-@dataclass(frozen=True)
-class PrintMonitor:
-    """Prints a line per step on rank 0."""
+def printing(
+    comm: MPI.Intracomm, feasible: FeasibleSet, multiplications: Callable[[], int]
+) -> Monitor:
+    """Print a line per step on rank 0: outer iteration, step, ‖g^P‖, ‖Qx‖ if known, and counts.
 
-    comm: MPI.Intracomm  # communicator
-    # the set; rows that it constrains and that carry a force are said to touch
-    feasible: FeasibleSet
-    multiplications: Callable[[], int]  # multiplications by F so far
+    They are of rows that the set constrains and that carry a force, and of multiplications by F.
+    """
+    if comm.rank == 0:
+        print("outer step                |gP|        |Qx|  touching  iterations", flush=True)
 
-    def __post_init__(self) -> None:
-        """Print the head of the columns."""
-        if self.comm.rank == 0:
-            print("outer step                |gP|        |Qx|  touching  iterations", flush=True)
-
-    def __call__(
-        self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
-    ) -> None:
-        """Print outer iteration, step, ‖g^P‖, ‖Qx‖ if known, touching constraints, iterations."""
-        face = self.feasible.face(x, np.zeros(len(x)))
-        own = int(np.sum((face.status != Status.FREE) & face.carrying))
-        touching = self.comm.allreduce(own)
-        if self.comm.rank == 0:
+    def monitor(steps: Steps, step: str, x: Array, gradient: float, equality: float) -> None:
+        face = feasible.face(x, np.zeros(len(x)))
+        touching = comm.allreduce(int(np.sum((face.status != Status.FREE) & face.carrying)))
+        if comm.rank == 0:
             known = f"{equality:.4e}" if equality > 0.0 else ""
-            figures = f"{projected_gradient:.4e}  {known:10s}  {touching:8d}"
-            print(
-                f"{steps.outer:5d} {step:<13s} {figures}  {self.multiplications():10d}", flush=True
-            )
+            figures = f"{gradient:.4e}  {known:10s}  {touching:8d}  {multiplications():10d}"
+            print(f"{steps.outer:5d} {step:<13s} {figures}", flush=True)
+
+    return monitor

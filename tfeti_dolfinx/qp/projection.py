@@ -128,8 +128,15 @@ class WithinFace:
         """Return the face of x, without the rows that stay open."""
         face = self._feasible.face(x, g)
         status = np.where(self._open, Status.OPEN, face.status)
-        stays = np.any(self._open[face.tangent_rows] & (face.tangents != 0.0), axis=1)
-        return replace(face.with_tangents(~stays), free=face.free & ~self._open, status=status)
+        moves = ~np.any(self._open[face.tangent_rows] & (face.tangents != 0.0), axis=1)
+        return replace(
+            face,
+            free=face.free & ~self._open,
+            status=status,
+            tangent_rows=face.tangent_rows[moves],
+            tangents=face.tangents[moves],
+            curvature=face.curvature[moves],
+        )
 
 
 @dataclass(frozen=True)

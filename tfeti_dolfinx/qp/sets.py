@@ -97,11 +97,6 @@ class Face:
             return self
         return replace(self, tangents=(self.tangents.T / np.sqrt(1.0 + self.curvature)).T)
 
-    def with_tangents(self, kept: Array) -> Face:
-        """Return the face with some of its tangents only, the others held."""
-        rows, tangents = self.tangent_rows[kept], self.tangents[kept]
-        return replace(self, tangent_rows=rows, tangents=tangents, curvature=self.curvature[kept])
-
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
         own = np.asarray((x.T * self.free).T)

@@ -19,11 +19,11 @@ from tfeti_dolfinx.qp.problem import (
     ConvergedReason,
     KnownProduct,
     Monitor,
-    PrintMonitor,
     QPResult,
     Start,
     homogenise,
     no_monitor,
+    printing,
 )
 from tfeti_dolfinx.qp.projection import UNBALANCED
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
@@ -120,7 +120,7 @@ def solve_dual(
             "bears it, or a Dirichlet condition or a spring besides"
         )
     if monitor is None and options.monitor:
-        monitor = PrintMonitor(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
+        monitor = printing(qp.coarse.comm, qp.feasible, lambda: dual.F.count)
     scale = begin.reference, begin.rounding
     rule = make_rule(dual, options.number, options.atol, scale, goal)
     own, most = getattr(options, qp_type), options.max_it

@@ -327,12 +327,12 @@ class ContactDynamics(ContactProblem):
         motion.towards = free = motion.free
         system.tools.set_out(motion.size)
         if self._predictor is not None:  # what contact allows the bodies without elasticity
-            system.make_up_to("right side", self._seconds)
+            system.make(self._seconds, "right side")
             with system.tools.adrift():
                 overlap = system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0)
             if overlap:
                 system.change("constraints")
-                system.make_up_to("right side", self._seconds)
+                system.make(self._seconds, "right side")
             motion.towards = self._predictor.nearest(free, inertia.M, system.gluing, system.tools)
         system.change("load")
 
