@@ -60,6 +60,8 @@ class NewtonParameters:
     stage: float = 0.1
     patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
     in_part: int = 3  # steps in a row that do not halve it: from then on ways may be taken in part
+    unbalanced: int = 3  # ends in a row that do not balance the load, before rows leave one by one
+    one_by_one: int = 20  # most rows that leave a face so, before all leave that are outside
     circle: int = 300  # steps in a row that do not halve ‖g^P‖: q falls by what Gλ = e lacks
     lost: float = 2e-15  # of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖
     # of the largest entry of a way: less is none; and of ‖F‖: a curvature that rounding may hide
@@ -74,8 +76,7 @@ class NewtonParameters:
     far: float = 1e30  # how far such a direction is followed, to end in Ω's cone of recession
     unseen: float = 1e-14  # of ‖F‖‖w‖: what may be left of Fw where F is not to see a direction w
     purifying: int = 200  # most steps of PCPG to that
-    # whether rows leave a face one by one after a step in which all together have raised q, or
-    # two in which what was left did not balance the load
+    # whether rows leave a face one by one after all together have raised q, or left no balance
     cautious: bool = True
     pcpg: PcpgParameters = PcpgParameters()  # those of solves on faces
 
@@ -198,9 +199,9 @@ class NewtonIteration:
         least: The last ‖g^P‖ that was half of the one before.
         idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
         since: So many have not found ‖g^P‖ half of ``least``.
-        unbalanced: Whether the last end of step 3 was outside of Ω or did not fulfil Gλ = e.
+        unbalanced: So many last ends of step 3 were outside of Ω or did not fulfil Gλ = e.
         resume: Whether λ is where PCPG has stopped.
-        cautious: Whether rows leave as they block, after q rose, or two ends did not balance.
+        cautious: Whether rows leave as they block, after q rose, or ends did not balance.
     """
 
     def __init__(
@@ -211,8 +212,8 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
         self.pressed = qp.feasible.face(z.lam, z.g)
         self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.since = 0, 0
-        self.resume = self.unbalanced = self.cautious = False
+        self.idle, self.since, self.unbalanced = 0, 0, 0
+        self.resume = self.cautious = False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
@@ -292,8 +293,8 @@ class NewtonIteration:
         stuck = self.since >= self.parameters.in_part and slope > 0.0
         self.resume = taken
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
-        unbalanced, self.unbalanced = self.unbalanced and not feasible, not feasible
-        early = unbalanced or (rose and self.idle < 2)
+        self.unbalanced = 0 if feasible else self.unbalanced + 1
+        early = self.unbalanced >= self.parameters.unbalanced or (rose and self.idle < 2)
         self.cautious = self.parameters.cautious and early
         if taken:
             self._go(end, 0.5 * double)
@@ -381,7 +382,7 @@ class FaceSolver:
             out, stays = self._has_left(end), False
             if not out or self._steps.cg >= self._max_it:
                 break
-            if cautious:
+            if cautious and self.rounds <= self._parameters.one_by_one:
                 z = self._blocked(z, end)
                 continue
             if (restored := self._restored(end)) is None:
