@@ -59,8 +59,9 @@ class NewtonParameters:
     # what a solve on a face that stays reduces its residual to, before step 1 looks at it
     stage: float = 0.1
     patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
-    in_part: int = 3  # steps in a row that do not halve it: from then on ways may be taken in part
-    unbalanced: int = 3  # ends in a row that do not balance the load, before rows leave one by one
+    # steps in a row that do not halve it: from then on ways may be taken in part, and rows leave
+    # one by one where a solve has ended without balance
+    in_part: int = 3
     one_by_one: int = 20  # most rows that leave a face so, before all leave that are outside
     circle: int = 300  # steps in a row that do not halve ‖g^P‖: q falls by what Gλ = e lacks
     lost: float = 2e-15  # of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖
@@ -199,9 +200,8 @@ class NewtonIteration:
         least: The last ‖g^P‖ that was half of the one before.
         idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
         since: So many have not found ‖g^P‖ half of ``least``.
-        unbalanced: So many last ends of step 3 were outside of Ω or did not fulfil Gλ = e.
         resume: Whether λ is where PCPG has stopped.
-        cautious: Whether rows leave as they block, after q rose, or ends did not balance.
+        cautious: Whether rows leave as they block, after q rose, or an end did not balance.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
         self.pressed = qp.feasible.face(z.lam, z.g)
         self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.since, self.unbalanced = 0, 0, 0
+        self.idle, self.since = 0, 0
         self.resume = self.cautious = False
 
     def look(self) -> None:
@@ -293,8 +293,8 @@ class NewtonIteration:
         stuck = self.since >= self.parameters.in_part and slope > 0.0
         self.resume = taken
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
-        self.unbalanced = 0 if feasible else self.unbalanced + 1
-        early = self.unbalanced >= self.parameters.unbalanced or (rose and self.idle < 2)
+        unbalanced = self.since >= self.parameters.in_part and not feasible
+        early = unbalanced or (rose and self.idle < 2)
         self.cautious = self.parameters.cautious and early
         if taken:
             self._go(end, 0.5 * double)
