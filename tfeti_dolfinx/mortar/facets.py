@@ -454,8 +454,10 @@ def hat_integrals(
         moved.interpolate(u)
         F = ufl.Identity(len(u)) + ufl.grad(moved)
         normal = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(W.mesh)
-        round_axis = moved[0] / ufl.SpatialCoordinate(W.mesh)[0] if dofs.axisymmetric else 0.0
-        weight *= ufl.sqrt(ufl.inner(normal, normal)) * (1.0 + round_axis)
+        weight *= ufl.sqrt(ufl.inner(normal, normal))
+        if dofs.axisymmetric:
+            r = ufl.SpatialCoordinate(W.mesh)[0]  # 0 on facets on the axis
+            weight *= 1.0 + ufl.conditional(ufl.gt(r, 0.0), moved[0] / r, 0.0)
     form = fem.form(weight * ufl.TestFunction(W) * ds(tags))
     per_node = np.zeros(dofs.num_nodes)
     per_node[node] = fem.assemble_vector(form).array

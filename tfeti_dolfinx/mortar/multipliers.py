@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array, quotient, sum_rows
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets, radii
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments
@@ -105,7 +105,7 @@ def facet_multipliers(
     covered = sum_rows(place, weight[:, None] * hats, len(facets))
     mass = sum_rows(place, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
     area = of.area[facets] * radii(kind, of, facets, np.full((len(facets), xi.shape[1]), 0.5))
-    share = covered.sum(axis=1) / area
+    share = quotient(covered.sum(axis=1), area)  # a facet on the axis has no area
     hardly = share <= SEARCH.hardly_covered
     mass[hardly] = np.eye(kind.hats.size)
     covered[hardly] = 0.0
