@@ -321,8 +321,7 @@ def _corners(solution: Solution) -> Iterator[str]:
         return
     v = relative_displacement(records, solution.dofs, solution.u)
     moved = np.maximum(np.linalg.norm(v, axis=1), np.abs(records.gap))
-    far = records.corner & records.within_reach
-    far &= moved > LIMITS.corners * largest(comm, solution.u)
+    far = records.corner & (moved > LIMITS.corners * largest(comm, solution.u))
     counts = np.bincount(records.contact[far], minlength=len(solution.contacts))
     for i in np.flatnonzero(summed(comm, counts)):
         name, (a, b) = solution.contacts[i].name, solution.contacts[i].surfaces
