@@ -314,8 +314,8 @@ class Obstacle(ContactPartner):
             distance = distance / dofs.lookup(vertices, share)[0].ravel()
         if not (isinstance(self.shape, RigidBody) and self.shape.free):
             facets = with_held_vertices(facets, dofs, normals, held.flag if held else None)
-        side = Side(facets, hat_areas(kind, facets), normals)
-        share = shares_at_edges(facets, dofs, towards, across)
+        share, edges = shares_at_edges(facets, dofs, towards, across)
+        side = Side(facets, hat_areas(kind, facets), normals, edges)
         integrals = integrate_distance(kind, facets, distance.reshape(corners.shape[:2]), share)
         found = conditions(dofs, contact, side, integrals)
         if isinstance(self.shape, RigidBody):
@@ -491,10 +491,11 @@ class Contact(ContactPartner):
             whole = facets.radius ** (dofs.bs - 1)
             if count := count_over(dofs.comm, facets.area <= SEARCH.degenerate * whole):
                 raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")
-            facets, normals = with_averaged_normals(facets, dofs, across)
+            facets, normals, edges = with_averaged_normals(facets, dofs, across)
             facets = with_curvature(facets, dofs, kind, across)
             facets = with_held_vertices(facets, dofs, normals, held.flag if held else None)
-            sides.append(Side(facets, hat_areas(kind, facets), normals))
+            areas, facets = hat_areas(kind, facets), apart_at_edges(facets, dofs, edges)
+            sides.append(Side(facets, areas, normals, edges))
         return sides[0], sides[1]
 
     def _meet(
@@ -510,16 +511,15 @@ class Contact(ContactPartner):
         kind, comm, across = facet_kind(dofs), dofs.comm, held.across if held else None
         moved, curved = dofs.nodes is not None, self.gap == CURVED
         distance = max(height := SEARCH.seen * reach, deep := SEARCH.seen * depth)
-        apart, edges = zip(*(apart_at_edges(s.facets, dofs, across) for s in sides), strict=True)
-        aside = False
+        own, edges, aside = sides[0], (sides[0].edges, sides[1].edges), False
         if dofs.nodes is not None:  # faces without edges press as they are meshed, however narrow
             aside = any_rank(comm, bool(np.any(edges) or np.any(np.diff(dofs.nodes, axis=0))))
-        images = with_images(apart[1], dofs, across)
-        secondary, primary = rendezvous(apart[0], images, distance, comm)
+        images = with_images(sides[1].facets, dofs, across)
+        secondary, primary = rendezvous(own.facets, images, distance, comm)
         with raised_on_all_ranks(comm):
             pairs = possible_pairs(secondary, primary, distance)
             segments = find_segments(kind, secondary, primary, pairs, deep, height, aside)
-        own, where = sides[0], (segments, secondary, primary, across)
+        where = segments, secondary, primary, across
         normals, corner, secondary, segments = met_at_edges(dofs, edges, own.normals, *where)
         with raised_on_all_ranks(comm):
             integrals = integrate(kind, secondary, primary, segments, moved, curved)

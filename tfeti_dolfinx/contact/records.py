@@ -144,11 +144,13 @@ def given_slips(records: ContactRecords, dofs: TornDofs, flag: Array, values: Ar
     slip over each other. Flags and values are those of the owned groups, ``(g, gdim)``, values 0
     where nothing is prescribed.
     """
-    signless = replace(records, weight=np.abs(records.weight))
-    sums, weights = (relative_motion(signless, dofs, of) for of in (values, flag.astype(float)))
-    left = relative_motion(records, dofs, (~flag).astype(float))
-    motion = relative_motion(records, dofs, values) - records.motion
-    return np.einsum("ntg,ng->nt", records.tangents, motion + left * quotient(sums, weights))
+    (known,) = dofs.lookup(records.entry_group, np.hstack((values, ~flag, flag)))
+    value, free, given = np.split(known, 3, axis=1)
+    w, size = records.weight[:, None], np.abs(records.weight)[:, None]
+    terms = np.hstack((w * value, w * free, size * value, size * given))
+    sums = np.split(sum_rows(records.condition, terms, len(records)), 4, axis=1)
+    motion = sums[0] - records.motion + sums[1] * quotient(sums[2], sums[3])
+    return np.einsum("ntg,ng->nt", records.tangents, motion)
 
 
 def held_pressures(
@@ -175,11 +177,13 @@ def held_pressures(
 class Side:
     """A surface of a pair, or one that faces an obstacle."""
 
-    facets: Facets  # its facets on this rank, those of a pair with averaged normals and curvature
+    # its facets on this rank; those of a pair have a curvature, and off edges averaged normals
+    facets: Facets
     areas: Array  # ∫φ_i over each facet, shape (n, v)
     # direction in which each owned group may not go further: the averaged normal, at an obstacle
     # that towards the shape; 0 off the surface, shape (g, gdim)
     normals: Array
+    edges: Array  # which owned groups are at edges, as `edges_at_rest` finds, shape (g,)
 
 
 def conditions(

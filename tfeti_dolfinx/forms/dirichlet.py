@@ -82,9 +82,11 @@ class EndPlanes:
             at[np.abs(x[:, 0]) > near, :, 0] = False
         facets, flat = dofs.facet_nodes(dofs.decomposition.boundary), np.zeros_like(at)
         np.logical_or.at(flat, facets, at[facets].all(axis=1)[:, None])
-        # of owned groups, shape (g, 2, gdim)
-        self._on, flat = dofs.reduce(np.stack((at, flat), axis=1), np.logical_or).swapaxes(0, 1)
-        self._on &= summed(dofs.comm, np.sum(self._on & ~flat, axis=0)) == 0
+        on, flat = dofs.reduce(np.stack((at, flat), axis=1), np.logical_or).swapaxes(0, 1)
+        on &= summed(dofs.comm, np.sum(on & ~flat, axis=0)) == 0
+        # the owned groups on some plane, shape (n,), and on which, shape (n, 2, gdim)
+        self._groups = np.flatnonzero(on.any(axis=(1, 2)))
+        self._on = on[self._groups]
 
     def across(self, flag: Array, value: Array, agreement: float) -> Array | None:
         """Return flags of components across planes of symmetry, ``(g, gdim)``; None: none is one.
@@ -92,8 +94,9 @@ class EndPlanes:
         These are all of whose nodes have u_k prescribed, and alike: the mirror image moves along.
         Values that differ by less than ``agreement``, relative, are the same. Collective.
         """
-        on, value = self._on, value[:, None]
-        free, there = np.any(on & ~flag[:, None], axis=0), np.any(on, axis=0)
+        on, whole = self._on, np.zeros_like(flag)
+        flag, value = flag[self._groups, None], value[self._groups, None]
+        free, there = np.any(on & ~flag, axis=0), np.any(on, axis=0)
         most, least = (
             np.where(on, values, -np.inf).max(axis=0, initial=-np.inf) for values in (value, -value)
         )
@@ -102,7 +105,8 @@ class EndPlanes:
         free, there, most, least = found
         alike = most + least <= agreement * np.maximum(np.abs(most), np.abs(least))
         planes = (free == 0.0) & (there > 0.0) & alike
-        return np.any(on & planes, axis=1) if np.any(planes) else None
+        whole[self._groups] = np.any(on & planes, axis=1)
+        return whole if np.any(planes) else None
 
 
 def prescribe(

@@ -183,30 +183,31 @@ def local_facets(
 
 def with_averaged_normals(
     facets: Facets, dofs: TornDofs, across: Array | None
-) -> tuple[Facets, Array]:
+) -> tuple[Facets, Array, Array]:
     """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
     On a plane of symmetry they lie in it, as those of the whole surface, unless that has an edge
     there at rest. Return the averaged normal of each owned group, too, 0 off them, shape ``(g,
-    gdim)``.
+    gdim)``, and its ``edges_at_rest``.
     """
+    rest = normals_at_rest(facets, dofs)
     groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
     averaged = unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
     if across is not None:
-        averaged = unit(np.where(across & ~_edges(facets, dofs, across), 0.0, averaged))
+        averaged = unit(np.where(across & ~_edges(facets, rest[1], dofs, across), 0.0, averaged))
     (at_vertices,) = dofs.lookup(groups, averaged)
-    return replace(facets, vertex_normals=at_vertices.reshape(weighted.shape)), averaged
+    turned = replace(facets, vertex_normals=at_vertices.reshape(weighted.shape))
+    return turned, averaged, edges_at_rest(facets, rest, dofs, across)
 
 
-def _edges(facets: Facets, dofs: TornDofs, across: Array) -> Array:
+def _edges(facets: Facets, averaged: Array, dofs: TornDofs, across: Array) -> Array:
     """Return where the whole surface has edges on planes of symmetry, flags of groups. Collective.
 
-    There, at rest, normals of the next vertices are turned by no more than those on the plane. An
-    edge that begins or ends with an iterate would turn normals, which Newton's method does not
-    follow.
+    There normals of the next vertices, ``averaged`` at rest, are turned by no more than those on
+    the plane. An edge that begins or ends with an iterate would turn normals, which Newton's method
+    does not follow.
     """
     groups, corners = facets.vertices.ravel(), facets.corners
-    _, averaged = normals_at_rest(facets, dofs)
     (turned,) = dofs.lookup(groups, np.where(across, 0.0, np.abs(averaged)))
     most = turned.reshape(corners.shape).max(axis=1, keepdims=True)
     turned = np.broadcast_to(most, corners.shape).reshape(turned.shape)
@@ -216,23 +217,25 @@ def _edges(facets: Facets, dofs: TornDofs, across: Array) -> Array:
 
 def normals_at_rest(facets: Facets, dofs: TornDofs) -> tuple[Array, Array]:
     """Return normals of facets as they were meshed, and their means at owned groups. Collective."""
-    groups, hats = facets.vertices.ravel(), facet_kind(dofs).hats
-    (rest,) = dofs.lookup(groups, dofs.reduce(dofs.points(at_rest=True), np.minimum))
-    middle, corners = hats.points.mean(axis=0)[None], facets.corners
-    here, there = (
-        _normals(hats, x, middle)[0] for x in (corners, rest[:, : dofs.bs].reshape(corners.shape))
-    )
-    there = unit(there * np.sign(np.sum(here * facets.normal, axis=1, keepdims=True)))
-    repeated = np.repeat(there, corners.shape[1], axis=0)
-    return there, unit(dofs.reduce_on_owners(groups, repeated))
+    groups, normal, corners = facets.vertices.ravel(), facets.normal, facets.corners
+    if dofs.nodes is not None:
+        hats = facet_kind(dofs).hats
+        (rest,) = dofs.lookup(groups, dofs.reduce(dofs.points(at_rest=True), np.minimum))
+        places = corners, rest[:, : dofs.bs].reshape(corners.shape)
+        here, there = (_normals(hats, x, hats.points.mean(axis=0)[None])[0] for x in places)
+        normal = unit(there * np.sign(np.sum(here * normal, axis=1, keepdims=True)))
+    repeated = np.repeat(normal, corners.shape[1], axis=0)
+    return normal, unit(dofs.reduce_on_owners(groups, repeated))
 
 
-def edges_at_rest(facets: Facets, dofs: TornDofs, across: Array | None) -> Array:
+def edges_at_rest(
+    facets: Facets, rest: tuple[Array, Array], dofs: TornDofs, across: Array | None
+) -> Array:
     """Return where facets turn as at an edge, as they were meshed: flags of groups. Collective.
 
     On planes of symmetry it is edges that cross them.
     """
-    groups, (facet, averaged) = facets.vertices.ravel(), normals_at_rest(facets, dofs)
+    groups, (facet, averaged) = facets.vertices.ravel(), rest
     own = np.repeat(facet, facets.vertices.shape[1], axis=0)
     (averaged,) = dofs.lookup(groups, averaged)
     if across is not None:
@@ -242,31 +245,33 @@ def edges_at_rest(facets: Facets, dofs: TornDofs, across: Array | None) -> Array
     return dofs.reduce_on_owners(groups, cosine, np.minimum, 1.0) < SEARCH.edge
 
 
-def apart_at_edges(facets: Facets, dofs: TornDofs, across: Array | None) -> tuple[Facets, Array]:
-    """Return facets with their own normals at edges, and which groups are at these. Collective.
+def apart_at_edges(facets: Facets, dofs: TornDofs, edges: Array) -> Facets:
+    """Return facets with their own normals at edges, flags of owned groups. Collective.
 
     A mean is of no side there.
     """
-    edges = edges_at_rest(facets, dofs, across)
     (at,) = dofs.lookup(facets.vertices.ravel(), edges)
     at = at.reshape(*facets.vertices.shape, 1)
     normals = np.where(at, facets.normal[:, None], facets.vertex_normals)
-    return replace(facets, vertex_normals=normals), edges
+    return replace(facets, vertex_normals=normals)
 
 
-def shares_at_edges(facets: Facets, dofs: TornDofs, towards: Array, across: Array | None) -> Array:
-    """Return how much facets beside edges count, by how they face a shape. Collective.
+def shares_at_edges(
+    facets: Facets, dofs: TornDofs, towards: Array, across: Array | None
+) -> tuple[Array, Array]:
+    """Return how much facets beside edges count, by how they face a shape, and edges. Collective.
 
     A side that stands on a plane bears nothing. ``towards`` has normals into the shape at the
     vertices, shape ``(n v, gdim)``.
     """
     if dofs.bs == 1:
-        return np.ones(len(facets))
-    vertices, edges = facets.vertices.reshape(-1, 1), edges_at_rest(facets, dofs, across)
+        return np.ones(len(facets)), np.zeros(dofs.num_groups, dtype=bool)
+    edges = edges_at_rest(facets, normals_at_rest(facets, dofs), dofs, across)
+    vertices = facets.vertices.reshape(-1, 1)
     cosine = np.einsum("ng,nvg->nv", facets.normal, towards.reshape(facets.corners.shape)).ravel()
     cosine, at = np.maximum(cosine, SEARCH.turned), np.arange(len(vertices))
     seen = facing_shares(dofs, vertices, at, cosine, edges, SEARCH.turned)
-    return seen.reshape(facets.vertices.shape).min(axis=1)
+    return seen.reshape(facets.vertices.shape).min(axis=1), edges
 
 
 def facing_shares(
