@@ -425,12 +425,12 @@ class ContactProblem:
 
         Collective. The forms and the values of their constants, contacts, conditions, mass and
         mesh, as they are when it is called; of functions on the mesh sums over it, of callables
-        their names. Options, extensions and ``stress`` are none of it.
+        their names, of rigid bodies what laws give at ``time``. Options and ``stress`` are not.
         ``agreement.check_same_problem`` compares two of them.
         """
         d = self.decomposition
         with agreeing(d.comm, "digest") as given:
-            given |= self._given()
+            given |= {**self._given(), **self._system.tools.laws(self.time)}
         known = {name: x for name, x in given.items() if name not in self._unknown_before}
         fields = fields_in(known)
         mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}

@@ -133,6 +133,11 @@ class Tools:
     def __len__(self) -> int:
         return len(self.bodies)
 
+    def laws(self, time: float) -> dict[str, tuple[Array, Array]]:
+        """Return motion and load of each body at a time, by names for messages."""
+        known = {body.name: body.motion_and_load(self._gdim, time) for body in self.bodies}
+        return {f"{name}: motion and load": values for name, values in known.items()}
+
     def read(self, time: float) -> set[str]:
         """Take the values that laws have at a time; return what they change. Collective.
 
@@ -142,11 +147,9 @@ class Tools:
         if not self.bodies:
             return set()
         with agreeing(self._comm, "laws of rigid bodies") as given:
-            both = [body.motion_and_load(self._gdim, time) for body in self.bodies]
-            given["time"] = time
-            for body, values in zip(self.bodies, both, strict=True):
-                given[f"{body.name}: motion and load"] = values
-        law, loads = bcast_from_root(self._comm, np.array(both).swapaxes(0, 1))
+            both = self.laws(time)
+            given |= {"time": time, **both}
+        law, loads = bcast_from_root(self._comm, np.array(list(both.values())).swapaxes(0, 1))
         loads = self.basis.T @ loads[self.tool, self.mode]
         moved = np.any(law != self.law, axis=1)
         placed = moved & np.array([body.large for body in self.bodies])
