@@ -23,7 +23,8 @@ class CoulombParameters:
     """Parameters of a solve with Coulomb's law."""
 
     tries: int = 4  # how often that may end and its bounds not be at rest; once where it has failed
-    finer: float = 0.03  # factor on its target each time, and at least on its residual
+    finer: float = 0.03  # of its residual: the target, at least, of which no look has told
+    nearer: float = 0.2  # the same where one has
     # its target at most, over the tolerance that a look leaves to a solve. Looks leave half of
     # what an answer needs (StoppingTolerances.aim), bar where a bound or a leap limits them
     looser: float = 2.0
@@ -353,7 +354,7 @@ class NewtonOnLaw:
     def __init__(self, dual: Dual, options: Options, rtol: float) -> None:
         self._dual, self._rtol = dual, rtol
         self.tries = PARAMETERS.tries if options.friction_type == "newton" else 0
-        self.steps, self._share, self._first = 0, 1.0, 0.0
+        self.steps, self._first = 0, 0.0
         self._recycled = dual.recycled
         self._before: Array = np.zeros(0)  # bounds before those of the last answer
         pairs = zip(dual.solved, (dual.d, dual.coarse.e), strict=True)
@@ -423,8 +424,11 @@ class NewtonOnLaw:
         residual = min(residuals)
         first = points[residuals.index(residual)]
         # Step 2: the target; the first also by what the last solve to rtol has left of its own
-        size = norm_over(qp.coarse.comm, qp.coarse.project(qp.d))
-        target = min(self._share * self._rtol * size, PARAMETERS.finer * residual, aim)
+        if aim < np.inf:
+            target = min(aim, PARAMETERS.nearer * residual)
+        else:
+            size = norm_over(qp.coarse.comm, qp.coarse.project(qp.d))
+            target = min(self._rtol * size, PARAMETERS.finer * residual)
         terms = max(norm * norm_over(dual.coarse.comm, start[0]), norm_over(dual.coarse.comm, qp.d))
         if self._first == 0.0:
             self._first, (rtol, left) = residual, dual.left
@@ -435,7 +439,7 @@ class NewtonOnLaw:
         end, steps = None, 0
         if target > PARAMETERS.rounding * terms:
             end, steps = newton_on_law(program, first, target)
-        self.steps, self._share = self.steps + steps, PARAMETERS.finer * self._share
+        self.steps += steps
         self.tries -= 1
         if end is None:
             self.tries, dual.recycled = min(self.tries, 1), self._recycled
