@@ -23,8 +23,8 @@ class CoulombParameters:
     """Parameters of a solve with Coulomb's law."""
 
     tries: int = 4  # how often that may end and its bounds not be at rest; once where it has failed
-    finer: float = 0.03  # of its residual: the target, at least, of which no look has told
-    nearer: float = 0.2  # the same where one has
+    finer: float = 0.03  # of its first residual: its target at most, where no look has told one
+    nearer: float = 0.2  # the same where a look has
     # its target at most, over the tolerance that a look leaves to a solve. Looks leave half of
     # what an answer needs (StoppingTolerances.aim), bar where a bound or a leap limits them
     looser: float = 2.0

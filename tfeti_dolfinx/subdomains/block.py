@@ -121,13 +121,12 @@ def kernel_of(K: Any, modes: Array) -> Array:
     """
     U, s, _ = np.linalg.svd(modes, full_matrices=False)
     R0 = U[:, s > TOLERANCES.dependent * s.max(initial=0.0)]
-    KR0, diagonal = K @ R0, K.diagonal()
-    # terms of the diagonal are often enough
-    if np.all(np.sum(R0 * KR0, axis=0) <= TOLERANCES.null * (diagonal @ R0**2)):
-        return np.asarray(R0)
+    KR0 = K @ R0
     turn = np.linalg.eigh(R0.T @ KR0)[1]
     R = R0 @ turn
-    energy, terms = np.sum(R * (KR0 @ turn), axis=0), diagonal @ R**2
+    energy = np.sum(R * (KR0 @ turn), axis=0)
+    diagonal = K.diagonal()
+    terms = diagonal @ R**2  # those of the diagonal, which are often enough
     if np.any(energy > TOLERANCES.null * terms):
         # In flat cells entries are differences of far larger numbers, which are as large as those
         # that other unknowns of the cell have: the largest diagonal entry that a row meets bounds
