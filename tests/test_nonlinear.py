@@ -390,6 +390,7 @@ def test_what_a_nonlinear_problem_does_not_take_is_named(comm):
         problem.update(load=ufl.ZeroBaseForm((ufl.TestFunction(problem.u.function_space),)))
     for said, given in {
         "rtol auto: it is for linear problems": {"petsc_options": {"rtol": "auto"}},
+        "tolerances: max_it=0: expected 1": {"tolerances": tfeti.NewtonTolerances(max_it=0)},
         "a J2Plasticity of another displacement": {"update": law.update, "state": law.state},
     }.items():
         with pytest.raises(tfeti.InputError, match=said):

@@ -12,7 +12,14 @@ from dolfinx import fem
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, sum_rows, sums
 from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, steering, summed
-from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type, named
+from tfeti_dolfinx.common.validation import (
+    FROM_1,
+    checked_callable,
+    checked_flag,
+    checked_number,
+    checked_type,
+    named,
+)
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
 from tfeti_dolfinx.contact.records import mean_of_copies
 from tfeti_dolfinx.errors import (
@@ -143,6 +150,7 @@ class NonlinearContactProblem(ContactProblem):
             given["state"] = list(state)
             tolerances = NewtonTolerances() if tolerances is None else tolerances
             checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")
+            checked_number(tolerances.max_it, "tolerances: max_it", FROM_1)
             given["tolerances"] = asdict(tolerances)
         self._tolerances = tolerances
         forcing, loosest, curvature = (0.3, 0.01, 0.5) if finite else (1.5, 0.1, 0.3)
