@@ -201,7 +201,7 @@ CASES = {
     ),
     "update on one": (update_on_one, rf"rank \d has called update {WHERE} solve"),
     "other times on one": (other_times_on_one, rf"the number of times is 3{ON}2 on rank 0"),
-    "a state that is cut on one": (broken, "the state is broken: u has"),
+    "a state that is cut on one": (broken, r"the state has \d+ displacements on this rank"),
     "a condition of another value on one": (
         lambda s, folder: s.solved(bcs=[s.held(0.01 if ODD else 0.0)]),
         rf"bcs\[0\]: value\[0\] is 0.01{ON}0.0 on rank 0",

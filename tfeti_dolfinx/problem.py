@@ -519,7 +519,7 @@ class ContactProblem:
             state: What ``state`` returned on this rank.
 
         Raises:
-            InputError: The state is of another mesh, other contacts or other ranks, or broken.
+            InputError: The state is of another mesh, space, other contacts or other ranks.
         """
         with agreeing(self.decomposition.comm, "restore") as given:
             self._check_state(state)
@@ -570,7 +570,7 @@ class ContactProblem:
         """Set the prediction of a step; nothing without inertia."""
 
     def _check_state(self, state: SavedState) -> None:
-        """Raise an InputError where a state is broken, or of something else. Not collective."""
+        """Raise an InputError where a state is of something else. Not collective."""
         check_state(state, self.dofs, len(self.contacts))
 
     def _take_motion(self, state: SavedState) -> None:
