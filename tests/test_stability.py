@@ -81,15 +81,15 @@ def test_flatness_knows_boxes_and_simplices(aspect, low):
             assert found == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(("nu", "degree"), [(0.3, 1), (0.495, 1), (0.495, 2)])
+@pytest.mark.parametrize(("nu", "degree"), [(0.3, 1), (0.48, 1), (0.48, 2)])
 def test_degree_1_is_warned_of_where_a_material_keeps_its_volume(nu, degree, caplog):
     """In the log once, however many solves there are; printed reports say where."""
     d = decomposed("triangle", 3, 4)
     V, a, L = forms(d.mesh, d.facet_tags, (0, -0.01), d.surface("top"), degree, hooke(2.0, nu))
     bcs = [clamp(V, d.facets("left"))]
     p = solved(tfeti.ContactProblem(a, L, bcs, [], d))
-    found = warnings_of("Poisson's ratio is about 0.495 ", p.report.warnings)
-    assert len(found) == (1 if nu == 0.495 and degree == 1 else 0), p.report.warnings
+    found = warnings_of("Poisson's ratio is about 0.48 ", p.report.warnings)
+    assert len(found) == (1 if nu == 0.48 and degree == 1 else 0), p.report.warnings
     p.solve()
     logged = warnings_of("Poisson", caplog.messages)
     assert logged == (found if d.comm.rank == 0 else [])

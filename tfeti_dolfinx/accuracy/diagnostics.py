@@ -64,8 +64,9 @@ class WarningLimits:
     # 10 to 50 were seen
     rounding: float = 30.0
     flat: float = 500.0  # ‖J‖‖J⁻¹‖/gdim of a cell that is about 1000 times as long as thick
-    # (λ + 2μ)/μ, 51 of ν = 0.49: from here on linear displacements are too stiff
-    locks: float = 50.0
+    # (λ + 2μ)/μ, 20 of ν = 0.474, from which on linear displacements are too stiff: errors of
+    # forces are ten times those of ν = 0.3. Of ν = 0.49 it is 51, of rubber pressed by 40 % 26
+    locks: float = 20.0
     resists: float = 0.01  # of a body's energy, that by which curved cells resist to turn
     turns: float = 0.1  # radians; what linear kinematics takes for strain is half the square, 0.5 %
     # of what the largest pressure presses together: gaps that straight facets change by as much had

@@ -224,18 +224,19 @@ def stretch_over_shear(x: Array, bs: int, multiply: Callable[[Array], Array]) ->
     """About (λ + 2μ)/μ of a subdomain, whatever its cells are.
 
     On a subdomain, which is free, uᵀKu of a stretch along an axis is the volume times λ + 2μ, and
-    that of a shear along it the volume times μ. The smallest ratio over the axes; 0 where unknowns
-    are no displacements.
+    that of a shear along it the volume times μ. The smallest ratio over the axes, but for the
+    radius of an axisymmetric model, along which nothing is free; 0 where unknowns are no
+    displacements.
     """
     if bs != x.shape[1] or bs == 1 or len(x) == 0:
         return 0.0
-    x, ratios = x - x.mean(axis=0), []
+    x, ratios = x - x.mean(axis=0), list[tuple[bool, float]]()
     for i in range(bs):
-        stretch, shear = np.zeros_like(x), np.zeros_like(x)
-        stretch[:, i], shear[:, i] = x[:, i], x[:, (i + 1) % bs]
-        along, across = (float(u @ multiply(u)) for u in (stretch.ravel(), shear.ravel()))
-        ratios.append(along / max(across, TINY))
-    return min(ratios)
+        ways = np.zeros((3, *x.shape))  # a stretch, a shear and a motion
+        ways[0, :, i], ways[1, :, i], ways[2, :, i] = x[:, i], x[:, (i + 1) % bs], np.ptp(x)
+        along, across, moved = (float(u @ multiply(u)) for u in ways.reshape(3, -1))
+        ratios.append((moved > across, along / max(across, TINY)))
+    return min(ratios)[1]
 
 
 # --- Equal subdomains -------------------------------------------------------------------------
