@@ -252,9 +252,9 @@ class NonlinearContactProblem(ContactProblem):
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
                     faster.past.clear()
                     self._set(u + d)
-            keeps = keeping.next(increment * most, t, tol.near * exact * most)
+            kept = keeping.keeps(forms.kept, increment * most, t, tol.near * exact * most)
             # old places leave a body that is let go a moment, which drives it
-            forms.kept = keeping.kept = keeps and not np.any(self._let_go)
+            forms.kept = kept and not np.any(self._let_go)
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
             f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
@@ -380,7 +380,7 @@ class NonlinearContactProblem(ContactProblem):
         except TfetiError:  # on all ranks
             if not forms.kept:
                 raise
-            forms.kept = self._keeping.kept = False
+            forms.kept = False
             again = True
         finally:
             forms.known = None
