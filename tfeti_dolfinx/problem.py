@@ -470,7 +470,7 @@ class ContactProblem:
         if start is None or (self._accepted and self._accepted[0] is solution):
             return
         self._system.tools.begin_here()
-        self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
+        self._system.count_slips_from(solution)
         self._accepted = (solution, start)
 
     def go_back(self) -> None:
@@ -550,7 +550,7 @@ class ContactProblem:
         solution = self._make_solution(state.u, state.lam, face, gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
-        system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
+        system.count_slips_from(solution)
 
     # ------------------------------------- what bodies with mass and nonlinear ones add
 

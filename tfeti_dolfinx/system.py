@@ -34,6 +34,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.settings import Settings
+from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains
 from tfeti_dolfinx.subdomains.subdomains import (
     FiniteElements,
@@ -98,7 +99,7 @@ class System(Generic[OwnForms]):
         self.tools, self.time = Tools(contacts, dofs), 0.0
         self.tools.check_mass(forms.has_mass)
         # displacement in primal order at which the load step begins; None: no displacement
-        self._rest: Array | None = None
+        self._begin: Array | None = None
         self._known_slips: tuple[ContactRecords, Array] | None = None
         self._stale, self._made = set(STAGES), Counter[str]()
         self.how, self._counted = settings.inverses(), 0
@@ -212,17 +213,13 @@ class System(Generic[OwnForms]):
         self.change("right side")
         return tuple(self._contacts)
 
-    def begin_at(self, rest: Array, known: tuple[ContactRecords, Array] | None = None) -> None:
-        """Let a load step begin at a displacement in primal order.
+    def begin_at(self, u: Array) -> None:
+        """Let a load step begin at a displacement in primal order."""
+        self._begin, self._known_slips = u, None
 
-        Conditions of the step before, with their slips at its end, count as long as conditions stay
-        the same.
-        """
-        self._rest, self._known_slips = rest, known
-
-    def count_slips_from(self, u: Array, known: tuple[ContactRecords, Array]) -> None:
-        """Let slips count from a displacement in primal order, with those of its conditions."""
-        self.begin_at(u, known)
+    def count_slips_from(self, end: Solution) -> None:
+        """Let a load step begin at the end of another, with its slips while conditions stay."""
+        self._begin, self._known_slips = end.u, (end.gluing.records, end.slip_at_end)
         if self._has_friction:
             self.change("right side")
         elif self._gluing is not None:
@@ -230,8 +227,8 @@ class System(Generic[OwnForms]):
 
     def begun(self) -> Array:
         """Return where the load step began, with free motions of rigid bodies, shape ``(n,)``."""
-        rest = np.zeros(self.subdomains.num_nodal) if self._rest is None else self._rest
-        return np.append(rest, self.tools.at_begin()[: self.tools.num_local])
+        u = np.zeros(self.subdomains.num_nodal) if self._begin is None else self._begin
+        return np.append(u, self.tools.at_begin()[: self.tools.num_local])
 
     def rows(self) -> KnownRows | None:
         """Return the rows that the last search ended with; None before the first."""
@@ -423,7 +420,7 @@ class System(Generic[OwnForms]):
     def _slip(self) -> tuple[Array, Array]:
         """Tangential v_i where the load step begins, and those of prescribed components alone."""
         records = self.search.records
-        if self._rest is None:
+        if self._begin is None:
             return (np.zeros(records.tangents.shape[:2]),) * 2
         if self._known_slips is not None:
             before, slip = self._known_slips
@@ -436,11 +433,11 @@ class System(Generic[OwnForms]):
                 way = before.motion - self.tools.motion_at_begin(records)
                 return (slip + np.einsum("ntg,ng->nt", records.tangents, way),) * 2
         begun = replace(records, motion=self.tools.motion_at_begin(records))
-        slip = slips(begun, self._dofs, self._rest)
+        slip = slips(begun, self._dofs, self._begin)
         if not self._has_friction:
             return slip, slip
         flag = made(self._prescribed).flag
-        given = np.where(flag, mean_of_copies(self._dofs, self._rest), 0.0)
+        given = np.where(flag, mean_of_copies(self._dofs, self._begin), 0.0)
         return slip, given_slips(begun, self._dofs, flag, given)
 
     def _destroy_dual(self) -> None:
