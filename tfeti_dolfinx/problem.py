@@ -280,8 +280,8 @@ class ContactProblem:
             start = None
             if self._start is not None:
                 dual.learn()
-                earlier, lam, mu, inverses = self._start
-                mu = mu if inverses == system.inverses else np.zeros(0)
+                earlier, lam, mu, number = self._start
+                mu = mu if number == system.kplus_number else np.zeros(0)
                 start = gluing.multipliers(earlier, lam), mu
                 start = None if dual.is_far(*start) else start
             goal = None
@@ -304,7 +304,7 @@ class ContactProblem:
             solution = self._make_solution(accuracy.u[:nodal], lam, result.face, gluing)
             self._solution = solution
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
-        end = gluing, lam, result.mu, system.inverses
+        end = gluing, lam, result.mu, system.kplus_number
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
         counts = SolverCounts.of_run(dual, result, settling)
@@ -453,7 +453,7 @@ class ContactProblem:
 
     def take_step(self, size: float) -> None:
         """Say how long the next load step is: without inertia only that steps are taken matters."""
-        self._system.how.mixed = False  # single precision pays in one alone
+        self._system.factory.mixed = False  # single precision pays in one alone
 
     def accept(self) -> None:
         """Take the last solution as the end of a load step. Collective.
@@ -548,7 +548,7 @@ class ContactProblem:
         # a face that only knows what rows do
         face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
         solution = self._make_solution(state.u, state.lam, face, gluing)
-        self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
+        self._accepted = (solution, (gluing, state.lam, state.mu, system.kplus_number))
         self._return()
         system.count_slips_from(solution)
 

@@ -53,7 +53,7 @@ class Settings:
             },
         }
 
-    def inverses(self) -> InverseFactory:
+    def inverse_factory(self) -> InverseFactory:
         """Return a factory of the subdomains' generalised inverses."""
         own, options = self.extensions, self.options
         # SMALSE-M multiplies by F itself, as clusters do when they make theirs
@@ -82,11 +82,11 @@ class Settings:
         choice = LocalChoice(options.local_type, expected)
         found = equals if choice.type in ("auto", "shared") else None
         keeps = own.subdomains is not None or "soft_springs" in options.without
-        equals.how.soft = 0.0 if keeps else INVERSES.weak if tangents else INVERSES.soft
-        if equals.how.mixed and found is not None and decomposition.mesh.geometry.dim == 3:
+        equals.factory.soft = 0.0 if keeps else INVERSES.weak if tangents else INVERSES.soft
+        if equals.factory.mixed and found is not None and decomposition.mesh.geometry.dim == 3:
             outlines = Counter(map(outline, np.split(dofs.points(), dofs.node_offsets[1:-1])))
-            equals.how.shared = {one for one, count in outlines.items() if count > 1}
-        make = own.block or (lambda item: SparseBlock(item, equals.how, found))
+            equals.factory.shared = {one for one, count in outlines.items() if count > 1}
+        make = own.block or (lambda item: SparseBlock(item, equals.factory, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
         rigid, count = list[RigidBlock](), len(tools.free_names) if tools else 0

@@ -67,8 +67,8 @@ class System(Generic[OwnForms]):
         tools: The rigid bodies.
         time: That of the rigid bodies' laws.
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
-        how: Makes K⁺ of subdomains.
-        inverses: How often K⁺ was made; multipliers μ of Gλ = e belong to one of them.
+        factory: Makes K⁺ of subdomains.
+        kplus_number: How often K⁺ was made; multipliers μ of Gλ = e belong to one K⁺.
         follows: Whether each stiffness is near the one before, as in Newton's method: what is known
             of ‖F‖, and the weights that rows are scaled with, stay. So multipliers go on.
         weights: Those of the last rows; None before.
@@ -102,11 +102,11 @@ class System(Generic[OwnForms]):
         self._begin: Array | None = None
         self._known_slips: tuple[ContactRecords, Array] | None = None
         self._stale, self._made = set(STAGES), Counter[str]()
-        self.how, self._counted = settings.inverses(), 0
-        self._equals = EqualSubdomains(self.how)
+        self.factory, self._counted = settings.inverse_factory(), 0
+        self._equals = EqualSubdomains(self.factory)
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self._left = 0.0, 0.0  # as `Dual` has it
-        self.inverses, self.follows = 0, False
+        self.kplus_number, self.follows = 0, False
         self.weights: Array | None = None
         self._K: Any = None
         self._search: ContactSearch | None = None
@@ -270,7 +270,7 @@ class System(Generic[OwnForms]):
         done, self._made = self._made, Counter()
         new = {*done, *(BRINGS.get(name) for name in done), *self._stale}
         has_kernel = self._dual is None or self.dual.coarse.dimension > 0
-        before, self._counted = self._counted, self.how.factorizations
+        before, self._counted = self._counted, self.factory.factorizations
         return StageCounts(
             factorizations=count_over(self._dofs.comm, self._counted - before),
             coarse_factorizations=done["coarse problem"] if has_kernel else 0,
@@ -294,7 +294,7 @@ class System(Generic[OwnForms]):
 
     def _assemble_stiffness(self) -> None:
         self._K = self.forms.stiffness()
-        self._blocks = self.elements.node_blocks(self._K, self.how)
+        self._blocks = self.elements.node_blocks(self._K, self.factory)
         if self.elements.replaces:  # the load that a force per volume makes depends on S
             self.change("load")
 
@@ -384,8 +384,8 @@ class System(Generic[OwnForms]):
     def _factor(self) -> None:
         dofs, trace = self._dofs, self.gluing.constraints.trace
         # single precision pays in one solve, without bounds that many programs look for
-        again = self.follows or self.inverses > 0
-        self.how.mixed &= not (
+        again = self.follows or self.kplus_number > 0
+        self.factory.mixed &= not (
             again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
         )
         self._subdomains = self._settings.make_subdomains(
@@ -399,7 +399,7 @@ class System(Generic[OwnForms]):
         self._K, self._subdomains.tangents = None, self.follows
         self._subdomains.retrace(trace)
         self._take_rounding(self._subdomains)
-        self.inverses += 1
+        self.kplus_number += 1
 
     def _make_dual(self) -> None:
         law, names = self._settings.extensions.feasible_set, self.tools.free_names

@@ -312,7 +312,7 @@ class FiniteElements:
     def __init__(self, dofs: TornDofs) -> None:
         self._dofs = dofs
 
-    def node_blocks(self, K: Any, how: InverseFactory) -> Array:
+    def node_blocks(self, K: Any, factory: InverseFactory) -> Array:
         """Return the stiffness's block of each primal node, shape ``(num_nodes, bs, bs)``.
 
         K is the stiffness of finite elements in DOLFINx's numbering, scipy CSR.
