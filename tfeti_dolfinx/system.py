@@ -104,8 +104,8 @@ class System(Generic[OwnForms]):
         self._stale, self._made = set(STAGES), Counter[str]()
         self.factory, self._counted = settings.inverse_factory(), 0
         self._equals = EqualSubdomains(self.factory)
-        self._seen = 0.0  # of ‖F‖, which more rows hardly change
-        self._left = 0.0, 0.0  # as `Dual` has it
+        # as the last `Dual` had them: more rows hardly change ‖F‖
+        self._norm, self._law_target = 0.0, (0.0, 0.0)
         self.kplus_number, self.follows = 0, False
         self.weights: Array | None = None
         self._K: Any = None
@@ -414,7 +414,7 @@ class System(Generic[OwnForms]):
         self._dual = self._settings.make_dual(
             self.gluing.constraints, self.subdomains, self._dofs, law, names
         )
-        self.dual.seen, self.dual.left = max(self.dual.seen, self._seen), self._left
+        self.dual.norm, self.dual.law_target = self._norm, self._law_target
         self._equals.kept.clear()
 
     def _slip(self) -> tuple[Array, Array]:
@@ -442,7 +442,7 @@ class System(Generic[OwnForms]):
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:
-            self._seen, self._left = self.dual.seen, self.dual.left
+            self._norm, self._law_target = self.dual.norm, self.dual.law_target
             self.dual.destroy()
         self._dual = None
 
@@ -451,7 +451,7 @@ class System(Generic[OwnForms]):
             self._subdomains.destroy()
         self._subdomains = None
         if not self.follows:
-            self._seen = 0.0
+            self._norm = 0.0
 
 
 # in the order in which they are made, with the name that their seconds have in the report

@@ -68,7 +68,7 @@ def estimate(system: System[Any], solution: Solution, rounding: float) -> Estima
     dual, u = system.dual, system.subdomains.with_rigid(solution.u)
     comm, factory, start = dual.coarse.comm, system.factory, perf_counter()
     factored = factory.factorizations
-    bound, moved = energy_bound(dual, solution.lam, u, dual.seen)
+    bound, moved = energy_bound(dual, solution.lam, u, dual.norm)
     squares = [float(sum(dual.subdomains.energies(u))), 0.0]
     if solution.has_stress:
         squares[1] = float(np.sum(solution.discretisation_error.x.array**2))

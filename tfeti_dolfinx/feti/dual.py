@@ -81,9 +81,9 @@ class Dual:
         coarse: The coarse space.
         deflation: Coarse space of the preconditioner, as clusters have one; else None.
         contact_rows: Number of normal and of tangential rows on all ranks.
-        seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
-        left: Rtol of the last solve by Newton's method on Coulomb's law, and what share of the
-            residual of its start was little enough.
+        norm: Largest estimate of ‖F‖ that solves have come to, 0 before.
+        law_target: Rtol of the last solve by Newton's method on Coulomb's law, and what share of
+            the residual of its start was little enough.
         law: Makes the set of multipliers from B and c.
         feasible: The set Ω of multipliers.
         pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
@@ -159,7 +159,7 @@ class Dual:
         self.contact_rows = constraints.contact_rows
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
-        self.seen, self.last, self.left = 0.0, KnownProduct(), (0.0, 0.0)
+        self.norm, self.last, self.law_target = 0.0, KnownProduct(), (0.0, 0.0)
         self.solved: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self.begin: Array | float = 0.0
         self.negligible: Array | float = 0.0
@@ -287,7 +287,7 @@ class Dual:
             self.coarse,
             self.feasible,
             preconditioner=None if on is None else on.on_all_rows(),
-            norm=self._norms.get(norm_steps, self.seen),
+            norm=self._norms.get(norm_steps, self.norm),
             preconditioner_on=None if on is None else on.on_face,
             recycled=self.recycled,
             sprung=self.subdomains.num_springs > 0,

@@ -314,7 +314,7 @@ class NewtonIteration:
         slope, curvature, size = self.qp.dot((-self.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
-        self.solver.directions.seen(curvature, size)
+        self.solver.directions.curves(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         lam = self.feasible.project(z.lam + length * p)
         self._go(Point(lam, z.g + length * Fp), 0.5 * length * slope)
@@ -457,7 +457,7 @@ class FaceSolver:
             if size == 0.0 or curvature > given.rounding * own.norm * square:
                 continue
             way, Fw = self._unseen(way, Fw)
-            if own.seen(*qp.dot((way, Fw), (way, way))):
+            if own.curves(*qp.dot((way, Fw), (way, way))):
                 continue
             # to the first bound, maybe infinite; rounding ends no way
             small = given.rounding * largest(qp.coarse.comm, way)
