@@ -40,12 +40,7 @@ from tfeti_dolfinx.forms.fields import (
     value_row,
     von_mises,
 )
-from tfeti_dolfinx.mortar.facets import (
-    diameter,
-    group_points,
-    hat_integrals,
-    surface_facets,
-)
+from tfeti_dolfinx.mortar.facets import diameter, group_points, hat_integrals, surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.qp.sets import Face
 

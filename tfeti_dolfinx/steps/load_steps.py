@@ -35,13 +35,7 @@ from tfeti_dolfinx.common.validation import (
 from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.io.output import POINTS, Series, changing_fields, checked_target, fields_of
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.saved_state import (
-    Table,
-    arranged,
-    labels_of_dofs,
-    rows_of,
-    same_labels,
-)
+from tfeti_dolfinx.saved_state import Table, arranged, labels_of_dofs, rows_of, same_labels
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.steps.checkpoint import Checkpoint
 

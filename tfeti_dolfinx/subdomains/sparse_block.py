@@ -13,12 +13,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.linalg.lapack import dpocon, dpotrf, dpotri
 
-from tfeti_dolfinx.common.arrays import (
-    TINY,
-    Array,
-    LocalMatrix,
-    as_petsc_matrix,
-)
+from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix, as_petsc_matrix
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import (

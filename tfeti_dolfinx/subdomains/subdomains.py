@@ -29,11 +29,7 @@ from tfeti_dolfinx.subdomains.block import (
     candidate_modes,
 )
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.local_operators import (
-    GroupedOperator,
-    LocalChoice,
-    LocalOperator,
-)
+from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalChoice, LocalOperator
 
 # --- All subdomains of a rank -----------------------------------------------------------------
 
