@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.validation import checked_number, checked_type
-from tfeti_dolfinx.constraints.gluing import Gluing
+from tfeti_dolfinx.constraints.gluing import Gluing, WarmStart
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts, gaps_by_position
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
@@ -51,9 +51,6 @@ from tfeti_dolfinx.system import System
 log = logging.getLogger(__name__)
 
 MAX_ROUNDS = 20  # of solves with more and more contact rows
-
-# rows, their λ, and the multipliers of Gλ = e with the number of the K⁺ that they are of
-Start = tuple[Gluing, Array, Array, int]
 
 
 class ContactProblem:
@@ -155,8 +152,8 @@ class ContactProblem:
         self._logged: set[str] = set()  # warnings
         self._solution: Solution | None = None
         self._let_go: Array = np.zeros(0, dtype=bool)  # flags of bodies that contact has let go
-        self._start: Start | None = None
-        self._accepted: tuple[Solution, Start] | None = None
+        self._start: WarmStart | None = None
+        self._accepted: tuple[Solution, WarmStart] | None = None
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
         if self.contacts:
@@ -278,11 +275,10 @@ class ContactProblem:
         # 1. the multipliers
         with stage("solve", seconds):
             start = None
-            if self._start is not None:
+            if (before := self._start) is not None:
                 dual.learn()
-                earlier, lam, mu, number = self._start
-                mu = mu if number == system.kplus_number else np.zeros(0)
-                start = gluing.multipliers(earlier, lam), mu
+                mu = before.mu if before.kplus_number == system.kplus_number else np.zeros(0)
+                start = gluing.multipliers(before.gluing, before.lam), mu
                 start = None if dual.is_far(*start) else start
             goal = None
             if options.rtol == "auto" and self._given_stress is not None:
@@ -304,7 +300,7 @@ class ContactProblem:
             solution = self._make_solution(accuracy.u[:nodal], lam, result.face, gluing)
             self._solution = solution
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
-        end = gluing, lam, result.mu, system.kplus_number
+        end = WarmStart(gluing, lam, result.mu, system.kplus_number)
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
         counts = SolverCounts.of_run(dual, result, settling)
@@ -501,11 +497,11 @@ class ContactProblem:
         assert self._accepted is not None
         solution, start = self._accepted
         (reach, _), dual = self._system.search.rows(), self._system.dual
-        state = SavedState.of(solution, start[2], dual, reach)
+        state = SavedState.of(solution, start.mu, dual, reach)
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
-        if dual.constraints is not start[0].constraints:
+        if dual.constraints is not start.gluing.constraints:
             return state
-        state = replace(state, image=dual.last.multiple(self.dofs.comm, start[1]))
+        state = replace(state, image=dual.last.multiple(self.dofs.comm, start.lam))
         kept = dual.recycled
         return state if kept is None else replace(state, directions=kept.in_order())
 
@@ -548,7 +544,8 @@ class ContactProblem:
         # a face that only knows what rows do
         face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
         solution = self._make_solution(state.u, state.lam, face, gluing)
-        self._accepted = (solution, (gluing, state.lam, state.mu, system.kplus_number))
+        start = WarmStart(gluing, state.lam, state.mu, system.kplus_number)
+        self._accepted = solution, start
         self._return()
         system.count_slips_from(solution)
 
