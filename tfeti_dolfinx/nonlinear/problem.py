@@ -165,7 +165,7 @@ class NonlinearContactProblem(ContactProblem):
         # of where bodies are
         self._last_digit = EPSILON * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
-        self._last_increment = self._loosest
+        self._first_increment = self._loosest  # of the last load step
         if finite:
             self._check_rotations()
 
@@ -195,16 +195,16 @@ class NonlinearContactProblem(ContactProblem):
 
     def _newton(self) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
-        forms, asked = self._system.forms, self._last_increment
-        faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
+        forms, expected = self._system.forms, self._first_increment
+        anderson, at_begin = Anderson(tol, comm), largest(comm, self.u.x.array)
         keeping = self._keeping
         keeping.begin()
-        before = np.inf
+        last = np.inf  # increment
         self._set(self.u.x.array)  # a law's numbers, or what they depend on, may have changed
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
-            rtol = float(np.clip(self._forcing * asked, exact, self._loosest))
+            rtol = float(np.clip(self._forcing * expected, exact, self._loosest))
             if not self._finite and rtol < tol.near * exact:
                 rtol = min(rtol, tol.last * exact)
             try:
@@ -218,39 +218,39 @@ class NonlinearContactProblem(ContactProblem):
             self._counts.newton_steps += 1
             end = self._conforming(u, np.array(self.u.x.array))
             d, most = end - u, largest(comm, end)
-            increments = self._increments(d, end, max(first, most))
+            increments = self._increments(d, end, max(at_begin, most))
             increment = float(increments.max(initial=0.0))
             # 2. line search
             t, remainders = self._line_search(u, d)
-            # what the next one is expected to be
-            asked = float(np.max(np.minimum(remainders, 1.0) * increments, initial=0.0))
+            # the next increment
+            expected = float(np.max(np.minimum(remainders, 1.0) * increments, initial=0.0))
             # 3. end
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
                 shares = np.clip(remainders, tol.steepest, tol.flattest)
-                asked = float(np.max(shares * increments, initial=0.0))
+                expected = float(np.max(shares * increments, initial=0.0))
                 left = np.maximum(tol.safety * remainders, tol.steepest) * increments
                 short |= t == 1.0 and bool(np.all(left <= exact))
-                if increment > tol.slow * before:
-                    asked = min(asked, tol.finer * rtol / self._forcing)
-            before = increment
-            nothing = most <= max(tol.nothing * first, self._least)
+                if increment > tol.slow * last:
+                    expected = min(expected, tol.finer * rtol / self._forcing)
+            last = increment
+            nothing = most <= max(tol.nothing * at_begin, self._least)
             if nothing or (short and rtol <= exact):
                 self._set(end)
                 return
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
-                self._last_increment = min(increment, self._loosest)
+                self._first_increment = min(increment, self._loosest)
             # a model that does not hold along d tells nothing of the next, nor does a place that is
             # one of many
             plain = t < 1.0 or bool(np.any(self._let_go))
             if plain:
-                faster.past.clear()
+                anderson.past.clear()
             plain |= step == 0 or not (self._finite or forms.kept)
-            if not plain:  # else the line search has ended there
-                self._set(faster.next(u, d))
+            if not plain:  # else u is where the line search has ended
+                self._set(anderson.next(u, d))
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
-                    faster.past.clear()
+                    anderson.past.clear()
                     self._set(u + d)
             kept = keeping.keeps(forms.kept, increment * most, t, tol.near * exact * most)
             # old places leave a body that is let go a moment, which drives it
