@@ -145,10 +145,10 @@ def test_motions_without_energy_are_named(cell, energy):
         block(K, x)
 
 
-@pytest.fixture(params=factor.SOLVERS)
+@pytest.fixture(params=factor.PACKAGES)
 def solver(request, monkeypatch):
     """PETSc as if it had this solver and those that come after it, but not those before."""
-    missing = factor.SOLVERS[: factor.SOLVERS.index(request.param)]
+    missing = factor.PACKAGES[: factor.PACKAGES.index(request.param)]
     has_solver = factor.has_solver
     monkeypatch.setattr(factor, "has_solver", lambda s: s not in missing and has_solver(s))
     for cached in (factor.default_solver, factor.say_if_not_cholmod):

@@ -13,7 +13,7 @@ from dolfinx import fem
 
 from tfeti_dolfinx.accuracy.diagnostics import ESTIMATES, Diagnostics, notes_of, of_estimates
 from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of
-from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
+from tfeti_dolfinx.common.agreement import agreeing, as_json, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
 from tfeti_dolfinx.common.logging import stage
@@ -431,7 +431,7 @@ class ContactProblem:
         fields = fields_in(known)
         mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
         sums = sums_of(d.comm, [d.mesh.geometry.x, *fields.values()])
-        found = {name: described(value) for name, value in given.items()}
+        found = {name: as_json(value) for name, value in given.items()}
         found["mesh"] = {**mesh, "points": sums[0]}
         found["sums over functions"] = dict(zip(fields, sums[1:], strict=True))
         return found

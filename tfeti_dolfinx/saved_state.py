@@ -103,7 +103,7 @@ def same_labels(kept: Array, here: Array) -> bool:
     return np.array_equal(np.sort(kept), np.sort(here))
 
 
-def rows_of(values: Array, labels: Array) -> Array:
+def as_rows(values: Array, labels: Array) -> Array:
     """Return values, one after the other, as rows for labels; there may be none."""
     return values.reshape(len(labels), values.size // max(len(labels), 1))
 
@@ -226,7 +226,7 @@ class SavedState:
             if f.name in KINDS:
                 continue
             if OF.get(f.name) == "nodes" and values.size:
-                values = rows_of(values, self.nodes)
+                values = as_rows(values, self.nodes)
             labels = getattr(self, OF[f.name]) if f.name in OF else None
             known = labels is not None and len(labels) == len(values)
             found[f.name] = (values, labels if known else None)

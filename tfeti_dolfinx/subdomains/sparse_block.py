@@ -361,15 +361,15 @@ class SparseBlock(Block):
 
     def multiply(self, u: Array) -> Array:
         """K u on all unknowns, shapes ``(n,)``."""
-        return (self.stiffness.product @ placed(u, self.place))[self.place]
+        return (self.stiffness.product @ scattered(u, self.place))[self.place]
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)``."""
-        return self.stiffness.solve(placed(b, self.place))[self.place]
+        return self.stiffness.solve(scattered(b, self.place))[self.place]
 
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)``; K_ii is factored once."""
-        return self.traced.apply_schur(placed(w, self.trace_rows))[self.trace_rows]
+        return self.traced.apply_schur(scattered(w, self.trace_rows))[self.trace_rows]
 
     def prepare(self, kind: OperatorKind) -> None:
         """Factor K_ii for ``"schur"``, where S is not known from a dense K⁺."""
@@ -398,7 +398,7 @@ class SparseBlock(Block):
         return np.searchsorted(self.traced.trace, self.place[self.trace_dofs])
 
 
-def placed(x: Array, places: Array) -> Array:
+def scattered(x: Array, places: Array) -> Array:
     """Return y with ``y[places] = x``."""
     y = np.empty(x.shape)
     y[places] = x
