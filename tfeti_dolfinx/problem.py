@@ -342,18 +342,19 @@ class ContactProblem:
         if tools:
             motion = tools.motion(gluing.records, found=True)
             gluing = replace(gluing, records=replace(gluing.records, motion=motion))
-        solution = Solution(
-            u=u,
-            lam=lam,
-            face=face,
-            gluing=gluing,
-            contacts=list(system.search.contacts),
+        return Solution(
+            u,
+            lam,
+            face,
+            gluing,
+            system.search.contacts,
             stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
+            finite=system.origin is not None,
+            boundary=system.elements.solved(u),
+            tool_motions=tools.motions(),
+            friction=system.known_friction,
         )
-        solution.finite, solution.boundary = system.origin is not None, system.elements.solved(u)
-        solution.tool_motions, solution.friction = tools.motions(), system.known_friction
-        return solution
 
     # ------------------------------------------------------- after a solve
 
