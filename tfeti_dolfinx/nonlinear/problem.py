@@ -361,14 +361,13 @@ class NonlinearContactProblem(ContactProblem):
         return np.sqrt(found.T).reshape(-1, d.num_bodies, columns)
 
     def _solve_linearised(self, rtol: float, step: int) -> float:
-        """Solve the contact problem of the model at u; return to what rtol. Collective.
+        """Solve the contact problem of the model at u, and return to what rtol. Collective.
 
-        That is the one of the answer where the tangent is that of the last model; the last problem
-        warns. A kept model without an answer, as its places may hold no body that turns, is made
-        anew.
+        That is the answer's where the tangent has the entries of the last one. The first problem
+        warns, and the last. A kept model without an answer, as its places may hold no body that
+        turns, is made anew.
         """
-        u, again = np.array(self.u.x.array), False
-        given, forms = self._settings.options, self._system.forms
+        u, given, forms = np.array(self.u.x.array), self._settings.options, self._system.forms
         self._go_to_places()
         try:
             self._system.look_for_changes()
@@ -377,17 +376,15 @@ class NonlinearContactProblem(ContactProblem):
             atol = max(given.atol, self._last_digit)
             self.options = replace(given, rtol=rtol, atol=atol, warnings=warns)
             self._solve_in_rounds()
+            return rtol
         except TfetiError:  # on all ranks
             if not forms.kept:
                 raise
-            forms.kept = False
-            again = True
         finally:
             forms.known = None
             if self._places is not None:
                 self._places.back()
-        if not again:
-            return rtol
+        forms.kept = False
         self._set(u)
         return self._solve_linearised(rtol, step)
 
