@@ -134,12 +134,11 @@ class Settings:
             )
         with added_options(self.prefix, self.factor_options):
             dual = Dual(
-                constraints=constraints,
-                subdomains=subdomains,
-                body_names=[*dofs.decomposition.body_names, *rigid_names],
-                mode_names=mode_names(gdim, dofs.bs),
+                constraints,
+                subdomains,
+                ([*dofs.decomposition.body_names, *rigid_names], mode_names(gdim, dofs.bs)),
                 preconditioner=preconditioner or PRECONDITIONERS.get(options.pc_type),
-                options_prefix=self.prefix,
+                prefix=self.prefix,
                 feasible=feasible,
                 deflation=self.extensions.deflation,
                 without=options.without,

@@ -66,8 +66,8 @@ class CoarseSpace(Coarse):
         constraints: Constraints,
         subdomains: Subdomains,
         names: tuple[Sequence[str], Sequence[str]],
-        sigma: float = 1.0,
-        prefix: str = "tfeti_coarse_",
+        sigma: float,
+        prefix: str,
     ) -> None:
         B, sets = constraints.B, constraints.sets
         self.subdomains, self.comm, self.sigma = subdomains, subdomains.comm, sigma
