@@ -69,20 +69,20 @@ class Settings:
         equals: EqualSubdomains,
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
         tools: Tools | None = None,
-        tangents: bool = False,
+        is_tangent: bool = False,
     ) -> Subdomains:
         """Make a Block of each subdomain, whose data is let go then, and one of all. Collective.
 
         ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; of
         ``tools`` those with free motions get Blocks. Stiffnesses that ``equals`` knows are shared,
-        unless the type of local operators is another; ``tangents`` do not stay.
+        unless the type of local operators is another; tangents do not stay.
         """
         own, options, decomposition = self.extensions, self.options, dofs.decomposition
-        expected = options.local_multiplications // (OF_TANGENT if tangents else 1)
+        expected = options.local_multiplications // (OF_TANGENT if is_tangent else 1)
         choice = LocalChoice(options.local_type, expected)
         found = equals if choice.type in ("auto", "shared") else None
         keeps = own.subdomains is not None or "soft_springs" in options.without
-        equals.factory.soft = 0.0 if keeps else INVERSES.weak if tangents else INVERSES.soft
+        equals.factory.soft = 0.0 if keeps else INVERSES.weak if is_tangent else INVERSES.soft
         if equals.factory.mixed and found is not None and decomposition.mesh.geometry.dim == 3:
             outlines = Counter(map(outline, np.split(dofs.points(), dofs.node_offsets[1:-1])))
             equals.factory.shared = {one for one, count in outlines.items() if count > 1}

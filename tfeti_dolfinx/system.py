@@ -69,8 +69,8 @@ class System(Generic[OwnForms]):
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
         factory: Makes K⁺ of subdomains.
         kplus_number: How often K⁺ was made; multipliers μ of Gλ = e belong to one K⁺.
-        follows: Whether each stiffness is near the one before, as in Newton's method: what is known
-            of ‖F‖, and the weights that rows are scaled with, stay. So multipliers go on.
+        is_tangent: Whether stiffnesses are tangents of Newton's method, each near the one before:
+            what is known of ‖F‖, and the weights of rows, stay. So multipliers go on.
         weights: Those of the last rows; None before.
     """
 
@@ -106,7 +106,7 @@ class System(Generic[OwnForms]):
         self._equals = EqualSubdomains(self.factory)
         # as the last `Dual` had them: more rows hardly change ‖F‖
         self._norm, self._law_target = 0.0, (0.0, 0.0)
-        self.kplus_number, self.follows = 0, False
+        self.kplus_number, self.is_tangent = 0, False
         self.weights: Array | None = None
         self._K: Any = None
         self._search: ContactSearch | None = None
@@ -190,7 +190,7 @@ class System(Generic[OwnForms]):
     def change(self, what: str) -> None:
         """Say that something has changed, a key of ``CHANGES``; what is out of date is freed."""
         self._stale |= set(CHANGES[what])
-        if what == "stiffness" and not self.follows:
+        if what == "stiffness" and not self.is_tangent:
             self._stale |= {"constraints", "friction"}
         if "coarse problem" in self._stale:
             self._destroy_dual()
@@ -323,7 +323,7 @@ class System(Generic[OwnForms]):
             self._gluing.constraints.B.destroy()
         search, dofs, tools = self.search, self._dofs, self.tools
         search.move()
-        if self.weights is None or not self.follows:
+        if self.weights is None or not self.is_tangent:
             scaling = self._settings.options.scaling
             self.weights = row_weights(self._blocks, scaling, dofs.comm)
         records = search.records
@@ -384,7 +384,7 @@ class System(Generic[OwnForms]):
     def _factor(self) -> None:
         dofs, trace = self._dofs, self.gluing.constraints.trace
         # single precision pays in one solve, without bounds that many programs look for
-        again = self.follows or self.kplus_number > 0
+        again = self.is_tangent or self.kplus_number > 0
         self.factory.mixed &= not (
             again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
         )
@@ -394,9 +394,9 @@ class System(Generic[OwnForms]):
             self._equals,
             self.elements.blocks,
             self.tools if self.tools.num_unknowns else None,
-            self.follows,
+            self.is_tangent,
         )
-        self._K, self._subdomains.tangents = None, self.follows
+        self._K, self._subdomains.is_tangent = None, self.is_tangent
         self._subdomains.retrace(trace)
         self._take_rounding(self._subdomains)
         self.kplus_number += 1
@@ -450,7 +450,7 @@ class System(Generic[OwnForms]):
         if self._subdomains is not None:
             self._subdomains.destroy()
         self._subdomains = None
-        if not self.follows:
+        if not self.is_tangent:
             self._norm = 0.0
 
 

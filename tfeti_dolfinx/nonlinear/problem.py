@@ -157,7 +157,7 @@ class NonlinearContactProblem(ContactProblem):
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact = self.options.number
-        self._system.follows = True
+        self._system.is_tangent = True
         self._begin = self._first
         self._system.begin_at(self.dofs.to_primal(self._begin))
         length = bcast_from_root(decomposition.comm, diameter(decomposition))

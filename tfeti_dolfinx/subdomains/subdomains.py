@@ -46,7 +46,7 @@ class Subdomains:
         elastic: The Blocks that have nodes, which are no rigid bodies, and num_nodal the number of
             their unknowns; those behind are of rigid bodies.
         num_modes: k; num_springs and num_clusters: springs and clusters on all ranks.
-        tangents: Whether stiffnesses are tangents of nonlinear materials.
+        is_tangent: Whether stiffnesses are tangents of Newton's method.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         elastic_parts: Each of the Blocks that have nodes, with its part of the n unknowns.
         size: n.
@@ -58,7 +58,7 @@ class Subdomains:
     """
 
     num_clusters = 0
-    tangents = False
+    is_tangent = False
 
     def __init__(
         self,
