@@ -74,7 +74,9 @@ if not tags.has("online"):  # type: ignore[name-defined]  # noqa: F821  # Sphinx
 TypeAliasForwardRef.__repr__ = lambda self: self.name  # type: ignore[method-assign]
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
-autodoc_type_aliases = {name: name for name in ("Array", "ArrayLike", "Gap", "Point", "Subdomains")}
+autodoc_type_aliases = {
+    name: name for name in ("Array", "ArrayLike", "Gap", "GivenSubdomains", "Vector")
+}
 autodoc_member_order = "bysource"
 toc_object_entries_show_parents = "hide"
 napoleon_google_docstring = True

@@ -60,8 +60,8 @@ def data(K, x, every=3, **changes):
     return SubdomainData(**{**arguments, **changes})
 
 
-def block(K, x, every=3, how=None, **changes):
-    return SparseBlock(data(K, x, every, **changes), how)
+def block(K, x, every=3, factory=None, **changes):
+    return SparseBlock(data(K, x, every, **changes), factory)
 
 
 @pytest.mark.parametrize(("what", "left"), [("scalar", 1), ("mass", 0), ("spring", 3)])
@@ -79,18 +79,18 @@ def test_the_kernel_is_what_the_form_leaves_free(what, left):
 def test_factors_are_made_when_they_are_needed_and_kept():
     """K's for any load and trace, K_ii's for a trace, when somebody asks for S."""
     K, x = stiffness("hexahedron", 2)
-    how = InverseFactory()
-    b = block(K, x, how=how)
+    factory = InverseFactory()
+    b = block(K, x, factory=factory)
     b.apply_stiffness(b.apply_pinv(np.ones(len(b.trace_dofs))))
     load = 2 * b.load
     b.update(f=load)
     assert np.array_equal(b.load, load)
-    assert how.factorizations == 1
+    assert factory.factorizations == 1
     b.apply_schur(np.ones(len(b.trace_dofs)))
-    assert how.factorizations == 2
+    assert factory.factorizations == 2
     b.retrace(np.arange(0, K.shape[0], 2))
     check_block(b, K)
-    assert how.factorizations == 3
+    assert factory.factorizations == 3
 
 
 def infinite(K):
@@ -145,10 +145,10 @@ def test_motions_without_energy_are_named(cell, energy):
         block(K, x)
 
 
-@pytest.fixture(params=factor.SOLVERS)
+@pytest.fixture(params=factor.PACKAGES)
 def solver(request, monkeypatch):
     """PETSc as if it had this solver and those that come after it, but not those before."""
-    missing = factor.SOLVERS[: factor.SOLVERS.index(request.param)]
+    missing = factor.PACKAGES[: factor.PACKAGES.index(request.param)]
     has_solver = factor.has_solver
     monkeypatch.setattr(factor, "has_solver", lambda s: s not in missing and has_solver(s))
     for cached in (factor.default_solver, factor.say_if_not_cholmod):

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from scenes import box, clamp, decomposed, forms, hooke, solved
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.common.agreement import agreeing, described
+from tfeti_dolfinx.common.agreement import agreeing, as_json
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.io.output import write_xdmf
 from tfeti_dolfinx.io.plot import plot_pressure
@@ -308,6 +308,6 @@ def test_counters_of_ufl_are_no_difference(scene, comm):
     sigma = hooke(E * nu + rho)(scene.a.arguments()[1])
     a = rho * E * nu * sigma[i, j] * ufl.grad(scene.v)[i, j] * ufl.dx(domain=scene.d.mesh)
     a += nu * ufl.inner(rho * sigma, E * sigma + nu * sigma) * ufl.dx(domain=scene.d.mesh)
-    told = comm.allgather(described(a))
+    told = comm.allgather(as_json(a))
     assert told[0]["structure"]
     assert all(other == told[0] for other in told)

@@ -84,14 +84,14 @@ def test_equal_subdomains_are_factored_once():
     d = decomposed("tetrahedron", 4, grid(2))
     p, subdomains = made(d, "shared", tfeti_pc_type="lumped")
     ranks_with_any = d.comm.allreduce(int(len(d.subdomains) > 0))
-    assert d.comm.allreduce(p._system.how.factorizations) == ranks_with_any
+    assert d.comm.allreduce(p._system.factory.factorizations) == ranks_with_any
     assert len({id(block.stiffness) for block in subdomains.blocks}) <= 1
     forms = subdomains.local_operator("pinv")
     forms.prepare()
     assert sum(forms.forms.values()) == len(subdomains.blocks)
     p.destroy()
     p, subdomains = made(d, "implicit", tfeti_pc_type="lumped")
-    assert p._system.how.factorizations == len(subdomains.blocks)
+    assert p._system.factory.factorizations == len(subdomains.blocks)
     assert len({id(block.stiffness) for block in subdomains.blocks}) == len(subdomains.blocks)
 
 

@@ -21,7 +21,7 @@ if cholmod() is None:
 def test_a_refined_solve_is_exact(units):
     """Single precision alone leaves seven digits, and has no such units."""
     K, x = stiffness("hexahedron", 9)
-    one, other = (block(units * K, x, how=InverseFactory(mixed=mixed)) for mixed in (True, False))
+    one, other = (block(units * K, x, 3, InverseFactory(mixed=m)) for m in (True, False))
     assert (one.stiffness.mixed, other.stiffness.mixed) == (True, False)
     assert 0.8 < one.stiffness.entries / other.stiffness.entries < 1.25
     b = 1e-60 * np.random.default_rng(1).standard_normal((len(one.load), 3))
@@ -34,19 +34,19 @@ def test_a_refined_solve_is_exact(units):
     for _ in range(MIXED.solves):
         found = one.solve(b[:, 0])
     assert apart(found, exact[:, 0]) <= 1e-13  # many have made a factor in double precision
-    assert one.stiffness.how.factorizations == 1 + other.stiffness.how.factorizations
+    assert one.stiffness.factory.factorizations == 1 + other.stiffness.factory.factorizations
 
 
 def test_where_single_precision_does_not_do_the_factor_is_petsc_s():
     """With options for it, and where a matrix is ill conditioned; or indefinite."""
-    K, how = stiffness("hexahedron", 9)[0], InverseFactory(mixed=True)
+    K, factory = stiffness("hexahedron", 9)[0], InverseFactory(mixed=True)
     one = eye_array(K.shape[0], format="csr")
     PETSc.Options()["tfeti_one_mat_cholmod_print"] = 0
-    assert type(how.factor(K + one, "tfeti_one_")) is CholeskyFactor
+    assert type(factory.factor(K + one, "tfeti_one_")) is CholeskyFactor
     PETSc.Options().delValue("tfeti_one_mat_cholmod_print")
-    assert type(how.factor(K + one, "tfeti_one_")) is MixedFactor
-    assert type(how.factor(K + 1e-9 * one, "tfeti_one_")) is CholeskyFactor
-    assert not how.mixed  # the next is not tried
+    assert type(factory.factor(K + one, "tfeti_one_")) is MixedFactor
+    assert type(factory.factor(K + 1e-9 * one, "tfeti_one_")) is CholeskyFactor
+    assert not factory.mixed  # the next is not tried
     with pytest.raises(ArithmeticError):
         MixedFactor(K - 1e-2 * one, cholmod(), CholeskyFactor)
 

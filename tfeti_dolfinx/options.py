@@ -19,7 +19,7 @@ from tfeti_dolfinx.common.validation import (
     Range,
     checked_type,
     described,
-    made,
+    from_names,
     parameters_of,
     shown,
 )
@@ -212,7 +212,7 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
     values = {n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
     for name in values.get("without", ()):
         values |= SWITCHES.get(name, {})
-    options: Options = made(Options, values)
+    options: Options = from_names(Options, values)
     return options
 
 

@@ -13,12 +13,12 @@ from dolfinx import fem
 
 from tfeti_dolfinx.accuracy.diagnostics import ESTIMATES, Diagnostics, notes_of, of_estimates
 from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of
-from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
+from tfeti_dolfinx.common.agreement import agreeing, as_json, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.validation import checked_number, checked_type
-from tfeti_dolfinx.constraints.gluing import Gluing
+from tfeti_dolfinx.constraints.gluing import Gluing, WarmStart
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts, gaps_by_position
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
@@ -51,9 +51,6 @@ from tfeti_dolfinx.system import System
 log = logging.getLogger(__name__)
 
 MAX_ROUNDS = 20  # of solves with more and more contact rows
-
-# rows, their λ, and the multipliers of Gλ = e with the number of the K⁺ that they are of
-Start = tuple[Gluing, Array, Array, int]
 
 
 class ContactProblem:
@@ -155,8 +152,8 @@ class ContactProblem:
         self._logged: set[str] = set()  # warnings
         self._solution: Solution | None = None
         self._let_go: Array = np.zeros(0, dtype=bool)  # flags of bodies that contact has let go
-        self._start: Start | None = None
-        self._accepted: tuple[Solution, Start] | None = None
+        self._start: WarmStart | None = None
+        self._accepted: tuple[Solution, WarmStart] | None = None
         self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
         if self.contacts:
@@ -278,11 +275,10 @@ class ContactProblem:
         # 1. the multipliers
         with stage("solve", seconds):
             start = None
-            if self._start is not None:
+            if (before := self._start) is not None:
                 dual.learn()
-                earlier, lam, mu, inverses = self._start
-                mu = mu if inverses == system.inverses else np.zeros(0)
-                start = gluing.multipliers(earlier, lam), mu
+                mu = before.mu if before.kplus_number == system.kplus_number else np.zeros(0)
+                start = gluing.multipliers(before.gluing, before.lam), mu
                 start = None if dual.is_far(*start) else start
             goal = None
             if options.rtol == "auto" and self._given_stress is not None:
@@ -304,7 +300,7 @@ class ContactProblem:
             solution = self._make_solution(accuracy.u[:nodal], lam, result.face, gluing)
             self._solution = solution
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
-        end = gluing, lam, result.mu, system.inverses
+        end = WarmStart(gluing, lam, result.mu, system.kplus_number)
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
         counts = SolverCounts.of_run(dual, result, settling)
@@ -346,18 +342,19 @@ class ContactProblem:
         if tools:
             motion = tools.motion(gluing.records, found=True)
             gluing = replace(gluing, records=replace(gluing.records, motion=motion))
-        solution = Solution(
-            u=u,
-            lam=lam,
-            face=face,
-            gluing=gluing,
-            contacts=list(system.search.contacts),
+        return Solution(
+            u,
+            lam,
+            face,
+            gluing,
+            system.search.contacts,
             stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
+            finite=system.origin is not None,
+            boundary=system.elements.solved(u),
+            tool_motions=tools.motions(),
+            friction=system.known_friction,
         )
-        solution.finite, solution.boundary = system.origin is not None, system.elements.solved(u)
-        solution.tool_motions, solution.friction = tools.motions(), system.known_friction
-        return solution
 
     # ------------------------------------------------------- after a solve
 
@@ -435,7 +432,7 @@ class ContactProblem:
         fields = fields_in(known)
         mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
         sums = sums_of(d.comm, [d.mesh.geometry.x, *fields.values()])
-        found = {name: described(value) for name, value in given.items()}
+        found = {name: as_json(value) for name, value in given.items()}
         found["mesh"] = {**mesh, "points": sums[0]}
         found["sums over functions"] = dict(zip(fields, sums[1:], strict=True))
         return found
@@ -453,7 +450,7 @@ class ContactProblem:
 
     def take_step(self, size: float) -> None:
         """Say how long the next load step is: without inertia only that steps are taken matters."""
-        self._system.how.mixed = False  # single precision pays in one alone
+        self._system.factory.mixed = False  # single precision pays in one alone
 
     def accept(self) -> None:
         """Take the last solution as the end of a load step. Collective.
@@ -470,7 +467,7 @@ class ContactProblem:
         if start is None or (self._accepted and self._accepted[0] is solution):
             return
         self._system.tools.begin_here()
-        self._system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
+        self._system.count_slips_from(solution)
         self._accepted = (solution, start)
 
     def go_back(self) -> None:
@@ -501,11 +498,11 @@ class ContactProblem:
         assert self._accepted is not None
         solution, start = self._accepted
         (reach, _), dual = self._system.search.rows(), self._system.dual
-        state = SavedState.of(solution, start[2], dual, reach)
+        state = SavedState.of(solution, start.mu, dual, reach)
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
-        if dual.constraints is not start[0].constraints:
+        if dual.constraints is not start.gluing.constraints:
             return state
-        state = replace(state, image=dual.last.multiple(self.dofs.comm, start[1]))
+        state = replace(state, image=dual.last.multiple(self.dofs.comm, start.lam))
         kept = dual.recycled
         return state if kept is None else replace(state, directions=kept.in_order())
 
@@ -535,7 +532,7 @@ class ContactProblem:
         system.tools.go_back(state.tools)  # by now laws may have others
         system.make(self._seconds)
         dual = system.dual
-        dual.seen, dual.left = max(dual.seen, float(state.norm)), tuple(state.left)
+        dual.norm, dual.law_target = max(dual.norm, float(state.norm)), tuple(state.left)
         state = state.on_rows(system.gluing)
         # what conditions prescribed then: by now they may have other values
         values = self.dofs.reduce(state.u.reshape(-1, self.dofs.bs), np.maximum)
@@ -548,9 +545,10 @@ class ContactProblem:
         # a face that only knows what rows do
         face = Face(np.zeros(len(state.lam), dtype=bool), state.status)
         solution = self._make_solution(state.u, state.lam, face, gluing)
-        self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
+        start = WarmStart(gluing, state.lam, state.mu, system.kplus_number)
+        self._accepted = solution, start
         self._return()
-        system.count_slips_from(solution.u, (solution.gluing.records, solution.slip_at_end))
+        system.count_slips_from(solution)
 
     # ------------------------------------- what bodies with mass and nonlinear ones add
 

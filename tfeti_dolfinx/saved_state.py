@@ -103,7 +103,7 @@ def same_labels(kept: Array, here: Array) -> bool:
     return np.array_equal(np.sort(kept), np.sort(here))
 
 
-def rows_of(values: Array, labels: Array) -> Array:
+def as_rows(values: Array, labels: Array) -> Array:
     """Return values, one after the other, as rows for labels; there may be none."""
     return values.reshape(len(labels), values.size // max(len(labels), 1))
 
@@ -144,7 +144,7 @@ class SavedState:
     lam: Array  # multipliers λ of this rank's rows
     mu: Array  # multipliers of Gλ = e; empty where they are not known
     norm: Array  # estimate of ‖F‖ that solves have come to, shape ()
-    left: Array  # what solves with Coulomb's law leave of residuals, shape (2,), see `Dual.left`
+    left: Array  # `Dual.law_target`: what solves with Coulomb's law leave of residuals, shape (2,)
     status: Array  # status of each row, see `qp.sets.Status`
     slip: Array  # where the load step began: tangential v_i of the conditions, (n, gdim - 1)
     reach: Array  # how far was searched in each contact
@@ -195,8 +195,8 @@ class SavedState:
             u=solution.u,
             lam=solution.lam,
             mu=mu,
-            norm=np.array(dual.seen),
-            left=np.array(dual.left),
+            norm=np.array(dual.norm),
+            left=np.array(dual.law_target),
             status=np.where(solution.carrying, bearing, Status.OPEN),
             slip=gluing.slip,
             reach=np.array(reach, dtype=float),
@@ -226,7 +226,7 @@ class SavedState:
             if f.name in KINDS:
                 continue
             if OF.get(f.name) == "nodes" and values.size:
-                values = rows_of(values, self.nodes)
+                values = as_rows(values, self.nodes)
             labels = getattr(self, OF[f.name]) if f.name in OF else None
             known = labels is not None and len(labels) == len(values)
             found[f.name] = (values, labels if known else None)

@@ -53,7 +53,7 @@ class Settings:
             },
         }
 
-    def inverses(self) -> InverseFactory:
+    def inverse_factory(self) -> InverseFactory:
         """Return a factory of the subdomains' generalised inverses."""
         own, options = self.extensions, self.options
         # SMALSE-M multiplies by F itself, as clusters do when they make theirs
@@ -69,24 +69,24 @@ class Settings:
         equals: EqualSubdomains,
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
         tools: Tools | None = None,
-        tangents: bool = False,
+        is_tangent: bool = False,
     ) -> Subdomains:
         """Make a Block of each subdomain, whose data is let go then, and one of all. Collective.
 
         ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; of
         ``tools`` those with free motions get Blocks. Stiffnesses that ``equals`` knows are shared,
-        unless the type of local operators is another; ``tangents`` do not stay.
+        unless the type of local operators is another; tangents do not stay.
         """
         own, options, decomposition = self.extensions, self.options, dofs.decomposition
-        expected = options.local_multiplications // (OF_TANGENT if tangents else 1)
+        expected = options.local_multiplications // (OF_TANGENT if is_tangent else 1)
         choice = LocalChoice(options.local_type, expected)
         found = equals if choice.type in ("auto", "shared") else None
         keeps = own.subdomains is not None or "soft_springs" in options.without
-        equals.how.soft = 0.0 if keeps else INVERSES.weak if tangents else INVERSES.soft
-        if equals.how.mixed and found is not None and decomposition.mesh.geometry.dim == 3:
+        equals.factory.soft = 0.0 if keeps else INVERSES.weak if is_tangent else INVERSES.soft
+        if equals.factory.mixed and found is not None and decomposition.mesh.geometry.dim == 3:
             outlines = Counter(map(outline, np.split(dofs.points(), dofs.node_offsets[1:-1])))
-            equals.how.shared = {one for one, count in outlines.items() if count > 1}
-        make = own.block or (lambda item: SparseBlock(item, equals.how, found))
+            equals.factory.shared = {one for one, count in outlines.items() if count > 1}
+        make = own.block or (lambda item: SparseBlock(item, equals.factory, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
         rigid, count = list[RigidBlock](), len(tools.free_names) if tools else 0
@@ -134,12 +134,11 @@ class Settings:
             )
         with added_options(self.prefix, self.factor_options):
             dual = Dual(
-                constraints=constraints,
-                subdomains=subdomains,
-                body_names=[*dofs.decomposition.body_names, *rigid_names],
-                mode_names=mode_names(gdim, dofs.bs),
+                constraints,
+                subdomains,
+                ([*dofs.decomposition.body_names, *rigid_names], mode_names(gdim, dofs.bs)),
                 preconditioner=preconditioner or PRECONDITIONERS.get(options.pc_type),
-                options_prefix=self.prefix,
+                prefix=self.prefix,
                 feasible=feasible,
                 deflation=self.extensions.deflation,
                 without=options.without,

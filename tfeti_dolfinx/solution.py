@@ -40,12 +40,7 @@ from tfeti_dolfinx.forms.fields import (
     value_row,
     von_mises,
 )
-from tfeti_dolfinx.mortar.facets import (
-    diameter,
-    group_points,
-    hat_integrals,
-    surface_facets,
-)
+from tfeti_dolfinx.mortar.facets import diameter, group_points, hat_integrals, surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 from tfeti_dolfinx.qp.sets import Face
 
@@ -85,9 +80,14 @@ class Solution:
         lam: Array,
         face: Face,
         gluing: Gluing,
-        contacts: Sequence[ContactPartner] = (),
-        stress: Stress | None = None,
-        thickness: Any = 1.0,
+        contacts: Sequence[ContactPartner],
+        *,
+        stress: Stress | None,
+        thickness: Any,
+        finite: bool,
+        boundary: Any,
+        tool_motions: Sequence[ToolMotion],
+        friction: Array | None,
     ) -> None:
         self.u, self.lam = u, lam
         self.carrying, self.holding = face.carrying, face.holding
@@ -95,11 +95,9 @@ class Solution:
         # Bᵀλ now: a problem destroys B with its rows
         self._row_forces = gluing.constraints.forces(self.lam)
         self.contacts, self.thickness = list(contacts), frozen(thickness)
-        self.tool_motions: Sequence[ToolMotion] = ()
-        self.finite = False
+        self.finite, self.boundary = finite, boundary
+        self.tool_motions, self.friction = tool_motions, friction
         self.v: Array | None = None
-        self.boundary: Any = None
-        self.friction: Array | None = None
         self._stress_of, self.has_stress = stress, stress is not None
         self.has_contact = bool(contacts)
         self.has_friction = any(contact.friction is not None for contact in contacts)

@@ -34,6 +34,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.settings import Settings
+from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains
 from tfeti_dolfinx.subdomains.subdomains import (
     FiniteElements,
@@ -66,10 +67,10 @@ class System(Generic[OwnForms]):
         tools: The rigid bodies.
         time: That of the rigid bodies' laws.
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
-        how: Makes K⁺ of subdomains.
-        inverses: How often K⁺ was made; multipliers μ of Gλ = e belong to one of them.
-        follows: Whether each stiffness is near the one before, as in Newton's method: what is known
-            of ‖F‖, and the weights that rows are scaled with, stay. So multipliers go on.
+        factory: Makes K⁺ of subdomains.
+        kplus_number: How often K⁺ was made; multipliers μ of Gλ = e belong to one K⁺.
+        is_tangent: Whether stiffnesses are tangents of Newton's method, each near the one before:
+            what is known of ‖F‖, and the weights of rows, stay. So multipliers go on.
         weights: Those of the last rows; None before.
     """
 
@@ -98,14 +99,14 @@ class System(Generic[OwnForms]):
         self.tools, self.time = Tools(contacts, dofs), 0.0
         self.tools.check_mass(forms.has_mass)
         # displacement in primal order at which the load step begins; None: no displacement
-        self._rest: Array | None = None
+        self._begin: Array | None = None
         self._known_slips: tuple[ContactRecords, Array] | None = None
         self._stale, self._made = set(STAGES), Counter[str]()
-        self.how, self._counted = settings.inverses(), 0
-        self._equals = EqualSubdomains(self.how)
-        self._seen = 0.0  # of ‖F‖, which more rows hardly change
-        self._left = 0.0, 0.0  # as `Dual` has it
-        self.inverses, self.follows = 0, False
+        self.factory, self._counted = settings.inverse_factory(), 0
+        self._equals = EqualSubdomains(self.factory)
+        # as the last `Dual` had them: more rows hardly change ‖F‖
+        self._norm, self._law_target = 0.0, (0.0, 0.0)
+        self.kplus_number, self.is_tangent = 0, False
         self.weights: Array | None = None
         self._K: Any = None
         self._search: ContactSearch | None = None
@@ -189,7 +190,7 @@ class System(Generic[OwnForms]):
     def change(self, what: str) -> None:
         """Say that something has changed, a key of ``CHANGES``; what is out of date is freed."""
         self._stale |= set(CHANGES[what])
-        if what == "stiffness" and not self.follows:
+        if what == "stiffness" and not self.is_tangent:
             self._stale |= {"constraints", "friction"}
         if "coarse problem" in self._stale:
             self._destroy_dual()
@@ -212,17 +213,13 @@ class System(Generic[OwnForms]):
         self.change("right side")
         return tuple(self._contacts)
 
-    def begin_at(self, rest: Array, known: tuple[ContactRecords, Array] | None = None) -> None:
-        """Let a load step begin at a displacement in primal order.
+    def begin_at(self, u: Array) -> None:
+        """Let a load step begin at a displacement in primal order."""
+        self._begin, self._known_slips = u, None
 
-        Conditions of the step before, with their slips at its end, count as long as conditions stay
-        the same.
-        """
-        self._rest, self._known_slips = rest, known
-
-    def count_slips_from(self, u: Array, known: tuple[ContactRecords, Array]) -> None:
-        """Let slips count from a displacement in primal order, with those of its conditions."""
-        self.begin_at(u, known)
+    def count_slips_from(self, end: Solution) -> None:
+        """Let a load step begin at the end of another, with its slips while conditions stay."""
+        self._begin, self._known_slips = end.u, (end.gluing.records, end.slip_at_end)
         if self._has_friction:
             self.change("right side")
         elif self._gluing is not None:
@@ -230,8 +227,8 @@ class System(Generic[OwnForms]):
 
     def begun(self) -> Array:
         """Return where the load step began, with free motions of rigid bodies, shape ``(n,)``."""
-        rest = np.zeros(self.subdomains.num_nodal) if self._rest is None else self._rest
-        return np.append(rest, self.tools.at_begin()[: self.tools.num_local])
+        u = np.zeros(self.subdomains.num_nodal) if self._begin is None else self._begin
+        return np.append(u, self.tools.at_begin()[: self.tools.num_local])
 
     def rows(self) -> KnownRows | None:
         """Return the rows that the last search ended with; None before the first."""
@@ -273,7 +270,7 @@ class System(Generic[OwnForms]):
         done, self._made = self._made, Counter()
         new = {*done, *(BRINGS.get(name) for name in done), *self._stale}
         has_kernel = self._dual is None or self.dual.coarse.dimension > 0
-        before, self._counted = self._counted, self.how.factorizations
+        before, self._counted = self._counted, self.factory.factorizations
         return StageCounts(
             factorizations=count_over(self._dofs.comm, self._counted - before),
             coarse_factorizations=done["coarse problem"] if has_kernel else 0,
@@ -297,7 +294,7 @@ class System(Generic[OwnForms]):
 
     def _assemble_stiffness(self) -> None:
         self._K = self.forms.stiffness()
-        self._blocks = self.elements.node_blocks(self._K, self.how)
+        self._blocks = self.elements.node_blocks(self._K, self.factory)
         if self.elements.replaces:  # the load that a force per volume makes depends on S
             self.change("load")
 
@@ -326,7 +323,7 @@ class System(Generic[OwnForms]):
             self._gluing.constraints.B.destroy()
         search, dofs, tools = self.search, self._dofs, self.tools
         search.move()
-        if self.weights is None or not self.follows:
+        if self.weights is None or not self.is_tangent:
             scaling = self._settings.options.scaling
             self.weights = row_weights(self._blocks, scaling, dofs.comm)
         records = search.records
@@ -387,8 +384,8 @@ class System(Generic[OwnForms]):
     def _factor(self) -> None:
         dofs, trace = self._dofs, self.gluing.constraints.trace
         # single precision pays in one solve, without bounds that many programs look for
-        again = self.follows or self.inverses > 0
-        self.how.mixed &= not (
+        again = self.is_tangent or self.kplus_number > 0
+        self.factory.mixed &= not (
             again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
         )
         self._subdomains = self._settings.make_subdomains(
@@ -397,12 +394,12 @@ class System(Generic[OwnForms]):
             self._equals,
             self.elements.blocks,
             self.tools if self.tools.num_unknowns else None,
-            self.follows,
+            self.is_tangent,
         )
-        self._K, self._subdomains.tangents = None, self.follows
+        self._K, self._subdomains.is_tangent = None, self.is_tangent
         self._subdomains.retrace(trace)
         self._take_rounding(self._subdomains)
-        self.inverses += 1
+        self.kplus_number += 1
 
     def _make_dual(self) -> None:
         law, names = self._settings.extensions.feasible_set, self.tools.free_names
@@ -417,13 +414,13 @@ class System(Generic[OwnForms]):
         self._dual = self._settings.make_dual(
             self.gluing.constraints, self.subdomains, self._dofs, law, names
         )
-        self.dual.seen, self.dual.left = max(self.dual.seen, self._seen), self._left
+        self.dual.norm, self.dual.law_target = self._norm, self._law_target
         self._equals.kept.clear()
 
     def _slip(self) -> tuple[Array, Array]:
         """Tangential v_i where the load step begins, and those of prescribed components alone."""
         records = self.search.records
-        if self._rest is None:
+        if self._begin is None:
             return (np.zeros(records.tangents.shape[:2]),) * 2
         if self._known_slips is not None:
             before, slip = self._known_slips
@@ -436,16 +433,16 @@ class System(Generic[OwnForms]):
                 way = before.motion - self.tools.motion_at_begin(records)
                 return (slip + np.einsum("ntg,ng->nt", records.tangents, way),) * 2
         begun = replace(records, motion=self.tools.motion_at_begin(records))
-        slip = slips(begun, self._dofs, self._rest)
+        slip = slips(begun, self._dofs, self._begin)
         if not self._has_friction:
             return slip, slip
         flag = made(self._prescribed).flag
-        given = np.where(flag, mean_of_copies(self._dofs, self._rest), 0.0)
+        given = np.where(flag, mean_of_copies(self._dofs, self._begin), 0.0)
         return slip, given_slips(begun, self._dofs, flag, given)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:
-            self._seen, self._left = self.dual.seen, self.dual.left
+            self._norm, self._law_target = self.dual.norm, self.dual.law_target
             self.dual.destroy()
         self._dual = None
 
@@ -453,8 +450,8 @@ class System(Generic[OwnForms]):
         if self._subdomains is not None:
             self._subdomains.destroy()
         self._subdomains = None
-        if not self.follows:
-            self._seen = 0.0
+        if not self.is_tangent:
+            self._norm = 0.0
 
 
 # in the order in which they are made, with the name that their seconds have in the report

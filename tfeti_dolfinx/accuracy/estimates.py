@@ -66,9 +66,9 @@ def estimate(system: System[Any], solution: Solution, rounding: float) -> Estima
             "estimate: the constraints are not those of the solution; expected a call after solve()"
         )
     dual, u = system.dual, system.subdomains.with_rigid(solution.u)
-    comm, how, start = dual.coarse.comm, system.how, perf_counter()
-    factored = how.factorizations
-    bound, moved = energy_bound(dual, solution.lam, u, dual.seen)
+    comm, factory, start = dual.coarse.comm, system.factory, perf_counter()
+    factored = factory.factorizations
+    bound, moved = energy_bound(dual, solution.lam, u, dual.norm)
     squares = [float(sum(dual.subdomains.energies(u))), 0.0]
     if solution.has_stress:
         squares[1] = float(np.sum(solution.discretisation_error.x.array**2))
@@ -79,7 +79,7 @@ def estimate(system: System[Any], solution: Solution, rounding: float) -> Estima
         algebraic=bound,
         discretisation=float(discretisation) if solution.has_stress else None,
         rounding=rounding,
-        factorizations=count_over(comm, how.factorizations - factored),
+        factorizations=count_over(comm, factory.factorizations - factored),
         lifting_multiplications=1,
         recoveries=int(moved > 0.0),
         seconds=perf_counter() - start,

@@ -63,21 +63,21 @@ class BoundaryBlock(SparseBlock):
     Args:
         data: The subdomain, of which the stiffness is not looked at.
         part: What takes its place.
-        how: How inverses are made.
+        factory: Makes inverses.
 
     Raises:
         InputError: The load is not finite, or a row touches nodes inside.
         FactorError: A factor could not be made.
     """
 
-    def __init__(self, data: SubdomainData, part: Part, how: InverseFactory) -> None:
+    def __init__(self, data: SubdomainData, part: Part, factory: InverseFactory) -> None:
         self._part = part
         if not part.on_surface[data.trace_dofs].all():
             raise InputError(
                 f"{part.name}: a value is prescribed inside boundary elements; expected it on "
                 "their surface"
             )
-        super().__init__(data, how)
+        super().__init__(data, factory)
 
     def _found(self, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness of the part's shape, and the place of its unknowns there."""
@@ -94,7 +94,7 @@ class Parts:
         dofs: Dof maps of displacements of degree 1.
         decomposition: The torn mesh.
         chosen: Flags of the subdomains of this rank, shape ``(S,)``.
-        how: How inverses are made.
+        factory: Makes inverses.
 
     Attributes:
         parts: By their positions in ``dofs.subdomains``.
@@ -104,9 +104,9 @@ class Parts:
     """
 
     def __init__(
-        self, dofs: TornDofs, decomposition: Decomposition, chosen: Array, how: InverseFactory
+        self, dofs: TornDofs, decomposition: Decomposition, chosen: Array, factory: InverseFactory
     ) -> None:
-        self._dofs, self._decomposition, self._how = dofs, decomposition, how
+        self._dofs, self._decomposition, self._factory = dofs, decomposition, factory
         self._surfaces = surfaces(dofs, decomposition, chosen)
         names, body = decomposition.body_names, decomposition.body_of_subdomain
         self._names = {
@@ -140,7 +140,7 @@ class Parts:
             for s, surface in self._surfaces.items():
                 own = self._unknowns(s)
                 K_s = subdomain_stiffness(K, rows[own], primal, own.start)
-                part = self.parts[s] = _part(self._names[s], surface, K_s, shapes, self._how)
+                part = self.parts[s] = _part(self._names[s], surface, K_s, shapes, self._factory)
                 own_blocks = node_blocks(part.shape.K, bs)[part.place[::bs] // bs]
                 blocks[own.start // bs : own.stop // bs] = own_blocks
         return blocks
@@ -178,7 +178,7 @@ class Parts:
 
         def make(data: SubdomainData) -> Block:
             part = by_name.get(data.name)
-            return make_block(data) if part is None else BoundaryBlock(data, part, self._how)
+            return make_block(data) if part is None else BoundaryBlock(data, part, self._factory)
 
         return make
 
@@ -219,7 +219,7 @@ def _part(
     surface: Surface,
     K: Any,
     shapes: dict[bytes, list[SurfaceStiffness]],
-    how: InverseFactory,
+    factory: InverseFactory,
 ) -> Part:
     """Return a subdomain, of a shape that is known or a new one."""
     key, order = places_in_order(surface.panels.x)
@@ -235,7 +235,7 @@ def _part(
     for shape in shapes[key]:
         if _equal(shape, placed, moved):
             return Part(name, shape, place)
-    shapes[key].append(SurfaceStiffness(name, placed, moved, how))
+    shapes[key].append(SurfaceStiffness(name, placed, moved, factory))
     return Part(name, shapes[key][-1], place)
 
 

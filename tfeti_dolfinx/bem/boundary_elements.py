@@ -99,10 +99,10 @@ class BoundaryElementAssembly(FiniteElements):
         self._chosen = elements.chosen(decomposition)
         self._made: Parts | None = None
 
-    def node_blocks(self, K: Any, how: InverseFactory) -> Array:
+    def node_blocks(self, K: Any, factory: InverseFactory) -> Array:
         """Make S, and return the stiffness's block of each primal node."""
-        self._made = Parts(self._dofs, self._decomposition, self._chosen, how)
-        found = self._made.take_stiffness(K, super().node_blocks(K, how))
+        self._made = Parts(self._dofs, self._decomposition, self._chosen, factory)
+        found = self._made.take_stiffness(K, super().node_blocks(K, factory))
         self.blocks, self.inside = self._made.blocks, self._made.inside()
         return found
 

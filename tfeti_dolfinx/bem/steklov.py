@@ -291,7 +291,7 @@ class SurfaceStiffness:
         name: Name for messages.
         surface: The surface; its points are those of all nodes, those on the surface first.
         K: Stiffness of finite elements, scipy CSR, shape ``(n, n)``.
-        how: How inverses are made.
+        factory: Makes inverses.
 
     Attributes:
         x: Points of the nodes.
@@ -306,9 +306,9 @@ class SurfaceStiffness:
         FactorError: S could not be made.
     """
 
-    def __init__(self, name: str, surface: Surface, K: Any, how: InverseFactory) -> None:
+    def __init__(self, name: str, surface: Surface, K: Any, factory: InverseFactory) -> None:
         self.name, self.x, self.surface = name, surface.panels.x, surface
-        self.K_fem, self._how = K, how
+        self.K_fem, self._factory = K, factory
         self.outer = int(surface.panels.nodes.max()) + 1
         self._cut = self.outer * surface.panels.dim
         law, x = law_of(K, surface, name), self.x[: self.outer]
@@ -326,7 +326,7 @@ class SurfaceStiffness:
         """K_S with its factors, made when it is first asked for, and again once nobody has it."""
         found = None if self._stiffness is None else self._stiffness()
         if found is None:
-            found = Stiffness(self.name, self.x, self.K, self._how)
+            found = Stiffness(self.name, self.x, self.K, self._factory)
             self._stiffness = ref(found)
         return found
 
@@ -381,9 +381,9 @@ class SurfaceStiffness:
 
     def _inner_factor(self) -> CholeskyFactor:
         cut = self._cut
-        self._how.factorizations += 1
+        self._factory.factorizations += 1
         try:
-            return CholeskyFactor(self.K_fem[cut:, cut:].tocsr(), self._how.prefix)
+            return CholeskyFactor(self.K_fem[cut:, cut:].tocsr(), self._factory.prefix)
         except FactorError as error:
             raise FactorError(
                 f"{self.name}: the stiffness inside boundary elements: {error}"

@@ -62,7 +62,7 @@ def agreeing(comm: MPI.Intracomm, call: str) -> Iterator[dict[str, Any]]:
     told: dict[str, Any] = {}
     try:
         yield given
-        told = {name: described(value) for name, value in given.items()}
+        told = {name: as_json(value) for name, value in given.items()}
     except Exception as caught:
         if TOLD in vars(caught):
             raise
@@ -105,7 +105,7 @@ def _difference_of_ranks(all_told: list[tuple[str, dict[str, Any]]]) -> str | No
     return None
 
 
-def described(value: Any) -> Any:
+def as_json(value: Any) -> Any:
     """Describe what a user gave, alike on all ranks that were given the same. Not collective.
 
     Numbers and texts are themselves, forms and expressions a hash of their structure with the
@@ -128,7 +128,7 @@ def described(value: Any) -> Any:
             return describe(value)
     if type(value).__module__.startswith(DESCRIPTIONS):
         names = [f.name for f in fields(value)] if is_dataclass(value) else list(vars(value))
-        public = {n: described(getattr(value, n)) for n in names if not n.startswith("_")}
+        public = {n: as_json(getattr(value, n)) for n in names if not n.startswith("_")}
         return {"type": type(value).__qualname__, **public}
     return _of_program(value)
 
@@ -177,7 +177,7 @@ def _of_ufl(given: ufl.Form | Expr) -> dict[str, Any]:
         "type": "Form" if is_form else "expression",
         "structure": _hash(parts),
         **{
-            f"constants[{k}]": described(getattr(c, "value", type(c).__qualname__))
+            f"constants[{k}]": as_json(getattr(c, "value", type(c).__qualname__))
             for k, c in enumerate(constants)
         },
         "functions": [str(f.ufl_element()) for f in functions],
@@ -223,10 +223,10 @@ def _of_condition(condition: fem.DirichletBC) -> dict[str, Any]:
 
 # in their order: a function is an expression, too
 KINDS: tuple[tuple[Any, Callable[[Any], Any]], ...] = (
-    (np.ndarray, lambda value: described(value.tolist())),
+    (np.ndarray, lambda value: as_json(value.tolist())),
     (os.PathLike, os.fspath),
-    (Mapping, lambda value: {str(key): described(item) for key, item in value.items()}),
-    ((list, tuple), lambda value: [described(item) for item in value]),
+    (Mapping, lambda value: {str(key): as_json(item) for key, item in value.items()}),
+    ((list, tuple), lambda value: [as_json(item) for item in value]),
     (fem.Constant, lambda value: np.asarray(value.value).tolist()),
     (fem.Function, lambda value: {"type": f"Function of {value.ufl_element()}"}),
     ((ufl.Form, Expr), _of_ufl),

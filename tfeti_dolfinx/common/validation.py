@@ -181,12 +181,12 @@ def parameters_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Parameter]
             yield Parameter(about.name or f.name, f.default, about, (*path, f.name))
 
 
-def made(kind: type, values: dict[str, Any]) -> Any:
+def from_names(kind: type, values: dict[str, Any]) -> Any:
     """An object of a dataclass of parameters from values by their names on the command line."""
     given: dict[str, Any] = {}
     for f in fields(kind):
         if is_dataclass(f.default):
-            given[f.name] = made(type(f.default), values)
+            given[f.name] = from_names(type(f.default), values)
         elif "is" in f.metadata and (name := f.metadata["is"].name or f.name) in values:
             given[f.name] = values[name]
     return kind(**given)

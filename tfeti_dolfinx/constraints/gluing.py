@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -249,6 +250,15 @@ class Gluing:
         tangents = contact.points[np.isin(sets.tangents, rows).any(axis=1)]
         own = np.unique(self.records.contact[np.concatenate((normals, tangents))])
         return sorted(set().union(*self.dofs.comm.allgather(own.tolist())))
+
+
+class WarmStart(NamedTuple):
+    """Multipliers of a solve, from which the next one starts."""
+
+    gluing: Gluing  # the rows that λ is of
+    lam: Array  # λ
+    mu: Array  # multipliers of Gλ = e
+    kplus_number: int  # the K⁺ that these are of, see `System`
 
 
 def glue(

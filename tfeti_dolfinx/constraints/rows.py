@@ -228,11 +228,7 @@ def _taken(result: PETSc.Vec, other: PETSc.Vec) -> Array:
 
 
 def assemble_constraints(
-    dofs: TornDofs,
-    tables: Sequence[Rows],
-    weights: Array,
-    contact: ContactRows,
-    rigid: int = 0,
+    dofs: TornDofs, tables: Sequence[Rows], weights: Array, contact: ContactRows, rigid: int = 0
 ) -> Constraints:
     """Assemble B of this rank's rows, with c = 0 and ψ = 0. Collective.
 

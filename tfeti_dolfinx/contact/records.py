@@ -187,11 +187,7 @@ class Side:
 
 
 def conditions(
-    dofs: TornDofs,
-    contact: int,
-    side: Side,
-    integrals: MortarIntegrals,
-    other: Side | None = None,
+    dofs: TornDofs, contact: int, side: Side, integrals: MortarIntegrals, other: Side | None = None
 ) -> ContactRecords:
     """Sum the contributions of facets on any rank to each node, and divide by ∫ψ_i. Collective.
 

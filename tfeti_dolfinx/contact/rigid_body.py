@@ -20,7 +20,7 @@ from tfeti_dolfinx.common.validation import (
     named,
     shown,
 )
-from tfeti_dolfinx.contact.shapes import Placed, Point, Shape, check_shape
+from tfeti_dolfinx.contact.shapes import Placed, Shape, Vector, check_shape
 from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh
 from tfeti_dolfinx.errors import InputError
 
@@ -148,7 +148,7 @@ class RigidBody:
     mass: float | None = None
     inertia: float | Sequence[float] | None = None
     velocity: Sequence[float] | None = None
-    point: Point | None = None
+    point: Vector | None = None
     name: str = ""
     large: bool = False
     _pose: Pose | None = field(default=None, repr=False)

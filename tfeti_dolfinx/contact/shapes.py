@@ -23,7 +23,7 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Shapes of rigid obstacles: signed distances ----------------------------------------------
 
-Point = tuple[float, ...] | list[float] | Array
+Vector = tuple[float, ...] | list[float] | Array
 
 
 class Shape(Protocol):
@@ -41,13 +41,13 @@ class Shape(Protocol):
         """Gradient of the signed distance, shape ``(3, n)``."""
 
 
-def _vector(values: Point, what: str) -> Array:
+def _vector(values: Vector, what: str) -> Array:
     """Return a vector of three components from two or three."""
     array = checked_vector(values, what, [2, 3], "two or three finite numbers")
     return np.pad(array, (0, 3 - len(array)))
 
 
-def _direction(values: Point, what: str) -> Array:
+def _direction(values: Vector, what: str) -> Array:
     vector = _vector(values, what)
     length = np.linalg.norm(vector)
     if length == 0.0:
@@ -58,7 +58,7 @@ def _direction(values: Point, what: str) -> Array:
 class Placed:
     """A shape that is placed by vectors of two or three components."""
 
-    _vectors: dict[str, Point]
+    _vectors: dict[str, Vector]
 
     def check_dimension(self, gdim: int, whose: str) -> None:
         """Raise an InputError where a vector is plane in 3D, or points out of the plane in 2D."""
@@ -82,7 +82,7 @@ class Plane(Placed):
         [1.25]
     """
 
-    def __init__(self, point: Point, normal: Point) -> None:
+    def __init__(self, point: Vector, normal: Vector) -> None:
         self.point = _vector(point, "point")
         self.normal = _direction(normal, "normal")
         self._vectors = {"point": point, "normal": normal}
@@ -112,7 +112,7 @@ class Sphere(Placed):
         [1.0]
     """
 
-    def __init__(self, centre: Point, radius: float, inside: bool = False) -> None:
+    def __init__(self, centre: Vector, radius: float, inside: bool = False) -> None:
         self.centre = _vector(centre, "centre")
         self.radius = checked_number(radius, "radius", POSITIVE)
         self.sign = -1.0 if checked_flag(inside, "inside") else 1.0
@@ -146,7 +146,7 @@ class Cylinder(Sphere):
         [1.0]
     """
 
-    def __init__(self, point: Point, axis: Point, radius: float, inside: bool = False) -> None:
+    def __init__(self, point: Vector, axis: Vector, radius: float, inside: bool = False) -> None:
         super().__init__(_vector(point, "point"), radius, inside)
         self.axis = _direction(axis, "axis")
         self._across = np.eye(3) - np.outer(self.axis, self.axis)

@@ -9,12 +9,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array, vstack
 
 from tfeti_dolfinx.common.arrays import Array, joined
-from tfeti_dolfinx.common.parallel import (
-    any_rank,
-    bcast_from_root,
-    chunk_offsets,
-    joined_over,
-)
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
@@ -71,8 +66,8 @@ class CoarseSpace(Coarse):
         constraints: Constraints,
         subdomains: Subdomains,
         names: tuple[Sequence[str], Sequence[str]],
-        sigma: float = 1.0,
-        prefix: str = "tfeti_coarse_",
+        sigma: float,
+        prefix: str,
     ) -> None:
         B, sets = constraints.B, constraints.sets
         self.subdomains, self.comm, self.sigma = subdomains, subdomains.comm, sigma

@@ -70,9 +70,10 @@ class Dual:
 
     Creation raises an InputError where squares of stiffness, load or values leave the range of
     floating point; a NoSolutionError where the load moves a body that nothing holds; a FactorError
-    where a matrix could not be factored. ``body_names`` and ``mode_names`` are for messages;
-    ``without`` names mechanisms that are switched off (``options.MECHANISMS``); ``recycle`` is how
-    many directions of earlier solves are kept, ``"auto"``: none before ``learn``.
+    where a matrix could not be factored. ``names`` are those of bodies and of their modes, for
+    messages; ``without`` names mechanisms that are switched off (``options.MECHANISMS``);
+    ``recycle`` is how many directions of earlier solves are kept, ``"auto"``: none before
+    ``learn``.
 
     Attributes:
         F: B K⁺ Bᵀ; ``rough``: F to single precision where that costs less, else None.
@@ -81,9 +82,9 @@ class Dual:
         coarse: The coarse space.
         deflation: Coarse space of the preconditioner, as clusters have one; else None.
         contact_rows: Number of normal and of tangential rows on all ranks.
-        seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
-        left: Rtol of the last solve by Newton's method on Coulomb's law, and what share of the
-            residual of its start was little enough.
+        norm: Largest estimate of ‖F‖ that solves have come to, 0 before.
+        law_target: Rtol of the last solve by Newton's method on Coulomb's law, and what share of
+            the residual of its start was little enough.
         law: Makes the set of multipliers from B and c.
         feasible: The set Ω of multipliers.
         pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
@@ -98,20 +99,20 @@ class Dual:
         self,
         constraints: Constraints,
         subdomains: Subdomains,
-        body_names: Sequence[str],
-        mode_names: Sequence[str],
-        preconditioner: MakePreconditioner | None = None,
-        options_prefix: str = "tfeti_",
-        feasible: FeasibleLaw = contact_set,
-        deflation: MakeDeflation | None = None,
-        without: Collection[str] = (),
-        recycle: int | str = 0,
-        dimension: int = 3,
+        names: tuple[Sequence[str], Sequence[str]],
+        *,
+        preconditioner: MakePreconditioner | None,
+        prefix: str,
+        feasible: FeasibleLaw,
+        deflation: MakeDeflation | None,
+        without: Collection[str],
+        recycle: int | str,
+        dimension: int,
     ) -> None:
         self._dimension = dimension
         self._without = without
         self.constraints, self.subdomains = constraints, subdomains
-        self._given = constraints
+        self._given = constraints  # before ``bound_friction``
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self._stiffness = largest(comm, subdomains.diagonal)
@@ -134,7 +135,7 @@ class Dual:
         if self.preconditioner is not None and own and self.late is None:
             self._lifting = self.preconditioner.local
         self._held_load: Array | None = None
-        prefix, sigma = f"{options_prefix}coarse_", 1.0
+        of_coarse, sigma = f"{prefix}coarse_", 1.0
         if subdomains.num_springs:
             sigma = mean_stiffness(subdomains, constraints.weights)
             on_springs: Array = np.zeros(constraints.num_rows)
@@ -142,24 +143,23 @@ class Dual:
             self.F.added = on_springs / sigma
             if self.preconditioner is not None:
                 self.preconditioner.added = sigma * on_springs
-        names = body_names, mode_names
-        self.coarse = CoarseSpace(constraints, subdomains, names, sigma, prefix)
+        self.coarse = CoarseSpace(constraints, subdomains, names, sigma, of_coarse)
         self.deflation: Deflation | None = None
         self._on_faces: FacePreconditioner | None = None
         if self.preconditioner is not None:
             if deflation is not None:
-                self.deflation = deflation(B, self.coarse, constraints.weights, prefix)
+                self.deflation = deflation(B, self.coarse, constraints.weights, of_coarse)
             self._on_faces = FacePreconditioner(
                 self.preconditioner,
                 constraints,
                 subdomains.diagonal,
-                f"{options_prefix}face_",
+                f"{prefix}face_",
                 self.deflation,
             )
         self.contact_rows = constraints.contact_rows
         self.law, self.feasible = feasible, feasible(constraints)
         self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
-        self.seen, self.last, self.left = 0.0, KnownProduct(), (0.0, 0.0)
+        self.norm, self.last, self.law_target = 0.0, KnownProduct(), (0.0, 0.0)
         self.solved: tuple[Array, Array] = np.zeros(0), np.zeros(0)
         self.begin: Array | float = 0.0
         self.negligible: Array | float = 0.0
@@ -287,7 +287,7 @@ class Dual:
             self.coarse,
             self.feasible,
             preconditioner=None if on is None else on.on_all_rows(),
-            norm=self._norms.get(norm_steps, self.seen),
+            norm=self._norms.get(norm_steps, self.norm),
             preconditioner_on=None if on is None else on.on_face,
             recycled=self.recycled,
             sprung=self.subdomains.num_springs > 0,

@@ -162,7 +162,7 @@ def dirichlet_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperat
         stiff = [
             block.bs
             for block in sparse
-            if (subdomains.tangents and block.bs == 3)
+            if (subdomains.is_tangent and block.bs == 3)
             or block.stiffness.stretch_over_shear > CHOICE.volume
         ]
         rigid = sum(len(block.trace_dofs) for block in subdomains.blocks[len(sparse) :])
@@ -202,7 +202,7 @@ def chosen_preconditioner(
     Where a subdomain keeps its volume, or springs hold one, the lumped one takes many times as many
     steps; there, in tangents, in clusters, and beside other Blocks it is Dirichlet's.
     """
-    if subdomains.tangents:
+    if subdomains.is_tangent:
         return dirichlet_preconditioner(B, subdomains)
     sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     other = subdomains.num_clusters > 0 or len(sparse) < len(subdomains.elastic)

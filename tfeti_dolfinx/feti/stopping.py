@@ -230,6 +230,8 @@ class Accuracy(StoppingRule):
     A rule of one's own overrides ``criteria``.
 
     Attributes:
+        dual: The dual problem.
+        norm: ‖F‖, or an estimate, at the last look; 1 where none is known.
         limits: Tolerances beside rtol; those of a class.
         tolerance: Norm of the residuals from which on one looks (again).
         recovered: What the last look has recovered.
@@ -260,14 +262,14 @@ class Accuracy(StoppingRule):
         scale: tuple[float, float],
         goal: ErrorTarget | None = None,
     ) -> None:
-        self._dual, self.rtol, self._atol, self._goal = dual, rtol, atol, goal
+        self.dual, self.rtol, self._atol, self._goal = dual, rtol, atol, goal
         reference, self._rounding = scale
         # looks for a goal are costly
         super().__init__(max(rtol**0.5 * reference, atol, self._rounding), waits=goal is not None)
         # where nothing drives any force, rows that only just touch have forces that are rounding
         drives = reference > self._rounding
         self._small = 0.01 * max(rtol * reference, self._rounding) if drives else self._rounding
-        self.looks, self._stopped, self._norm = 0, False, 1.0
+        self.looks, self._stopped, self.norm = 0, False, 1.0
         self._before: Measures | None = None
         self.estimates: dict[str, float] = {}
 
@@ -290,19 +292,19 @@ class Accuracy(StoppingRule):
         self, lam: Array, gradient: Array, face: Face, residual: float, norm: float
     ) -> ConvergedReason:
         """Assess an iterate, and return why to stop, or ITERATING. Collective."""
-        dual, self._norm = self._dual, norm or 1.0
+        dual, self.norm = self.dual, norm or 1.0
         # 1. its displacement, beside that of the look before
-        state = recover(dual.constraints, dual.coarse, lam, gradient, face, residual / self._norm)
+        state = recover(dual.constraints, dual.coarse, lam, gradient, face, residual / self.norm)
         self._before, u = (self.measures, self.u) if self.looks else (None, None)
         self.looks, self.waits = self.looks + 1, False
-        self._assess(state, measure(dual, state, face, self._norm, u))
+        self._assess(state, measure(dual, state, face, self.norm, u))
         reason = self._verdict(residual)
         # 2. in an answer bodies that nothing holds are placed: a rough iterate has forces too small
         # to hold them
         if state.loose.count and (reason > 0 or self._stopped):
             unseen = min(self.limits.share_unseen * self.rtol, self.limits.unseen)
             state = placed(dual.coarse, state, dual.begin, unseen)
-            now = measure(dual, state, face, self._norm)
+            now = measure(dual, state, face, self.norm)
             self._assess(state, replace(now, change=self.measures.change))
             reason = self._verdict(residual)
         return reason
@@ -312,7 +314,7 @@ class Accuracy(StoppingRule):
         given, now, bounded = self.limits, self.measures, self.checks.get("algebraic_error")
         # 1. errors over their tolerances, with rounding and, where forces move anything, without
         ratio, longest, strict, bound = steering(
-            self._dual.coarse.comm,
+            self.dual.coarse.comm,
             self.ratio(),
             now.longest,
             self.ratio(rounds=now.effect <= self._rounding),
@@ -340,7 +342,7 @@ class Accuracy(StoppingRule):
         self.allowed = self._tolerances()
         self.checks = self.criteria() | {"balance": Criterion(now.balance, self.allowed.balance)}
         if self._goal is not None:
-            bound, moved = energy_bound(self._dual, state.lam, state.u, self._norm)
+            bound, moved = energy_bound(self.dual, state.lam, state.u, self.norm)
             goal, rounding, known = self._goal(state.u), self.allowed.rounding, self.estimates
             allowed = max(self.limits.target * max(goal, 1e-5 * now.energy), rounding)
             self.checks["algebraic_error"] = Criterion(bound, allowed, size=now.energy)
@@ -361,11 +363,11 @@ class Accuracy(StoppingRule):
         that set, too.
         """
         first, self._before = self.checks, None
-        self._assess(self.recovered, measure(self._dual, self.recovered, face, self._norm))
+        self._assess(self.recovered, measure(self.dual, self.recovered, face, self.norm))
         for name, now in self.checks.items():
             error = np.maximum(now.error, first.get(name, now).error)
             self.checks[name] = now._replace(error=error)
-        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self.measures.longest)
+        ratio, longest = steering(self.dual.coarse.comm, self.ratio(), self.measures.longest)
         return bool(ratio <= 1.0 or longest <= self._atol)
 
     def examine_stopped(self, result: QPResult) -> None:
@@ -381,7 +383,7 @@ class Accuracy(StoppingRule):
         energy = np.sqrt(np.maximum(now.energies, 0.0))
         # where all is rounding, energy does not say how far anything moves
         noise = self.limits.noise * now.size.max(initial=0.0) + self._at_rest()
-        noise = np.maximum(noise, self._dual.negligible)
+        noise = np.maximum(noise, self.dual.negligible)
         known = (energy > 0.0) & (now.size > noise)
         shown = np.divide(now.elastic, energy, out=np.zeros_like(energy), where=known)
         estimate = shown * np.sqrt(now.correction_energies)
@@ -399,7 +401,7 @@ class Accuracy(StoppingRule):
         most = max(most, now.begin)
         all_rest = at_rest.min() if len(at_rest) else 0.0  # then forces are rounding, too
         noise = given.noise * most + given.load_noise * now.alone + all_rest
-        noise = np.maximum(noise, self._dual.negligible)
+        noise = np.maximum(noise, self.dual.negligible)
         displacement = self.rtol * share * now.size + noise
         largest = float(displacement.max(initial=0.0))
         # a body that nothing acts on, as one that was unloaded, rests: all of its u is error
@@ -407,7 +409,7 @@ class Accuracy(StoppingRule):
         displacement = np.maximum.reduce((displacement, at_rest, self.rtol * most * rests))
         # rounding of bodies that do not deform at all: its energy, and forces that make it
         rigid = float(np.sqrt(now.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
-        balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self._norm)
+        balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self.norm)
         return Tolerances(
             displacement=displacement,
             jump=2.0 * largest,

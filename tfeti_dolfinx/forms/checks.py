@@ -27,7 +27,7 @@ from tfeti_dolfinx.common.parallel import count_over
 from tfeti_dolfinx.common.validation import checked_type, is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, known_tags
-from tfeti_dolfinx.mesh.dofs import check_space, described, is_same_space
+from tfeti_dolfinx.mesh.dofs import check_space, is_same_space, space_in_words
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
 # linear forms, a load and a residual, and the bilinear ones beside them
@@ -161,8 +161,8 @@ def check_same_space(V: Any, W: fem.FunctionSpace, what: str, whose: str) -> Non
             return
         place = "" if V.mesh is W.mesh else " on another mesh"
         raise InputError(
-            f"{what} is from {described(V._cpp_object)}{place}; expected {whose}, "
-            f"{described(W._cpp_object)}"
+            f"{what} is from {space_in_words(V._cpp_object)}{place}; expected {whose}, "
+            f"{space_in_words(W._cpp_object)}"
         )
 
 

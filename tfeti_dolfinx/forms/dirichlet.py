@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.compat import space_of
 from tfeti_dolfinx.common.parallel import box_over_ranks, summed
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.dofs import TornDofs, described, is_same_space
+from tfeti_dolfinx.mesh.dofs import TornDofs, is_same_space, space_in_words
 
 
 def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
@@ -165,8 +165,8 @@ def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
         own = own.sub(component)
     if not is_same_space(space, own):
         raise InputError(
-            f"{what} is on {described(space)}; expected the space of a, "
-            f"{described(V._cpp_object)}, or V.sub(i) of it"
+            f"{what} is on {space_in_words(space)}; expected the space of a, "
+            f"{space_in_words(V._cpp_object)}, or V.sub(i) of it"
         )
     size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
     highest = int(bc.dof_indices()[0].max(initial=-1))

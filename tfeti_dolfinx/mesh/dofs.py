@@ -56,7 +56,7 @@ def is_same_space(V: Any, W: Any) -> bool:
     )
 
 
-def described(V: Any) -> str:
+def space_in_words(V: Any) -> str:
     """A C++ space for messages."""
     try:
         degree = V.element.basix_element.degree

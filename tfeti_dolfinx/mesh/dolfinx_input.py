@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, is_whole, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names, flags_of
-from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner
+from tfeti_dolfinx.mesh.partition import DEFAULT, GivenSubdomains, check_partitioner
 from tfeti_dolfinx.mesh.tearing import TORN, decomposed
 from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_facets
 
@@ -39,7 +39,7 @@ class GmshData(Protocol):
 
 def decompose(
     mesh: dmesh.Mesh | GmshData,
-    subdomains: Subdomains | None = None,
+    subdomains: GivenSubdomains | None = None,
     cell_tags: dmesh.MeshTags | None = None,
     facet_tags: dmesh.MeshTags | None = None,
     *,

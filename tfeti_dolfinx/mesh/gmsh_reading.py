@@ -28,7 +28,7 @@ from tfeti_dolfinx.mesh.gmsh_model import (
     physical_names,
     read_content,
 )
-from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner
+from tfeti_dolfinx.mesh.partition import DEFAULT, GivenSubdomains, check_partitioner
 from tfeti_dolfinx.mesh.tearing import decomposed
 from tfeti_dolfinx.mesh.untorn import (
     NO_TAG,
@@ -271,7 +271,7 @@ def _facet_tags(
 def read_gmsh(
     source: str | PathLike[str] | Any,
     comm: MPI.Intracomm,
-    subdomains: Subdomains | None = None,
+    subdomains: GivenSubdomains | None = None,
     *,
     partitioner: str = DEFAULT,
 ) -> Decomposition:

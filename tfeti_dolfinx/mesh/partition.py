@@ -17,7 +17,7 @@ from tfeti_dolfinx.mesh.cell_graph import CellGraph, Pieces
 from tfeti_dolfinx.mesh.round_parts import round_parts
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 
-Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
+GivenSubdomains = int | ArrayLike | Callable[[Array], ArrayLike]
 # unknowns of a subdomain where nobody gives a number: its factor is cheap, and kernels and
 # interfaces are still few
 UNKNOWNS = 4000
@@ -94,7 +94,7 @@ def connected_parts(pieces: Pieces, absorb: bool) -> tuple[Array, dict[int, list
 # --- Assignment of cells to subdomains --------------------------------------------------------
 
 
-def given_subdomains(mesh: UntornMesh, subdomains: Subdomains, comm: MPI.Intracomm) -> Array:
+def given_subdomains(mesh: UntornMesh, subdomains: GivenSubdomains, comm: MPI.Intracomm) -> Array:
     """Subdomain of each local cell, numbered 0, 1, ... without holes. Collective.
 
     Given is one id per local cell; or a callable that gets cell midpoints, shape ``(3, n)``, and

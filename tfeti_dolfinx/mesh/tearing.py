@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.partition import (
     DEFAULT,
     UNKNOWNS,
-    Subdomains,
+    GivenSubdomains,
     connected_parts,
     given_subdomains,
     make_parts,
@@ -85,7 +85,7 @@ log = logging.getLogger(__name__)
 
 def decomposed(
     untorn: UntornMesh,
-    subdomains: Subdomains | None,
+    subdomains: GivenSubdomains | None,
     partitioner: str,
     comm: MPI.Intracomm,
     spread: bool = False,

@@ -436,10 +436,7 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
 
 
 def hat_integrals(
-    dofs: TornDofs,
-    names: Sequence[str | int],
-    thickness: Any = 1.0,
-    u: fem.Function | None = None,
+    dofs: TornDofs, names: Sequence[str | int], thickness: Any = 1.0, u: fem.Function | None = None
 ) -> Array:
     """Return ∫φ_i of the hats of degree 1 over the union of surfaces, by names or tags. Collective.
 

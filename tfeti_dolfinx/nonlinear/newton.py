@@ -105,32 +105,32 @@ class ModelKeeping:
     tolerances: NewtonTolerances
     finite: bool
     freezes: bool = True  # whether places are kept: until bodies turn while they are
-    kept: bool = False  # whether the present model is that of the linearised problem before
     # increments: the first of a load step, the first of a model, and the last one
     first: float = 0.0
     of_model: float = 0.0
-    before: float = 0.0
+    before: float = np.inf
 
     def begin(self) -> None:
-        """Begin a load step with a new model."""
-        self.kept, self.first, self.of_model, self.before = False, 0.0, 0.0, 0.0
+        """Begin a load step."""
+        self.first, self.of_model, self.before = 0.0, 0.0, np.inf
 
-    def next(self, size: float, t: float, near: float) -> bool:
+    def keeps(self, kept: bool, size: float, t: float, near: float) -> bool:
         """Return whether to keep the model after an increment and its length t.
 
-        Increments up to ``near`` are near the tolerance.
+        ``kept``: it is that of the linearised problem before. Increments up to ``near`` are near
+        the tolerance.
         """
         tol = self.tolerances
-        self.first, slow = self.first or size, self.kept and size > tol.slow * self.before
+        self.first, slow = self.first or size, kept and size > tol.slow * self.before
         if self.finite:
-            if not self.kept:
+            if not kept:
                 turns = self.of_model > 0.0 and size > max(tol.turning * self.of_model, near)
                 self.freezes, self.of_model = self.freezes and not turns, size
-            good = self.freezes and (not self.kept or size > tol.frozen * self.of_model)
+            good = self.freezes and (not kept or size > tol.frozen * self.of_model)
         else:
             good = size <= tol.settled * self.first
-        self.kept, self.before = good and t == 1.0 and not slow, size
-        return self.kept
+        self.before = size
+        return good and t == 1.0 and not slow
 
 
 @dataclass

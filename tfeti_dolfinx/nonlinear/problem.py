@@ -165,7 +165,7 @@ class NonlinearContactProblem(ContactProblem):
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact = self.options.number
-        self._system.follows = True
+        self._system.is_tangent = True
         self._begin = self._first
         self._system.begin_at(self.dofs.to_primal(self._begin))
         length = bcast_from_root(decomposition.comm, diameter(decomposition))
@@ -173,7 +173,7 @@ class NonlinearContactProblem(ContactProblem):
         # of where bodies are
         self._last_digit = EPSILON * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
-        self._last_increment = self._loosest
+        self._first_increment = self._loosest  # of the last load step
         if finite:
             self._check_rotations()
 
@@ -203,16 +203,16 @@ class NonlinearContactProblem(ContactProblem):
 
     def _newton(self) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
-        forms, asked = self._system.forms, self._last_increment
-        faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
+        forms, expected = self._system.forms, self._first_increment
+        anderson, at_begin = Anderson(tol, comm), largest(comm, self.u.x.array)
         keeping = self._keeping
         keeping.begin()
-        before = np.inf
+        last = np.inf  # increment
         self._set(self.u.x.array)  # a law's numbers, or what they depend on, may have changed
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
-            rtol = float(np.clip(self._forcing * asked, exact, self._loosest))
+            rtol = float(np.clip(self._forcing * expected, exact, self._loosest))
             if not self._finite and rtol < tol.near * exact:
                 rtol = min(rtol, tol.last * exact)
             try:
@@ -226,43 +226,43 @@ class NonlinearContactProblem(ContactProblem):
             self._counts.newton_steps += 1
             end = self._conforming(u, np.array(self.u.x.array))
             d, most = end - u, largest(comm, end)
-            increments = self._increments(d, end, max(first, most))
+            increments = self._increments(d, end, max(at_begin, most))
             increment = float(increments.max(initial=0.0))
             # 2. line search
             t, remainders = self._line_search(u, d)
-            # what the next one is expected to be
-            asked = float(np.max(np.minimum(remainders, 1.0) * increments, initial=0.0))
+            # the next increment
+            expected = float(np.max(np.minimum(remainders, 1.0) * increments, initial=0.0))
             # 3. end
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
                 shares = np.clip(remainders, tol.steepest, tol.flattest)
-                asked = float(np.max(shares * increments, initial=0.0))
+                expected = float(np.max(shares * increments, initial=0.0))
                 left = np.maximum(tol.safety * remainders, tol.steepest) * increments
                 short |= t == 1.0 and bool(np.all(left <= exact))
-                if increment > tol.slow * before:
-                    asked = min(asked, tol.finer * rtol / self._forcing)
-            before = increment
-            nothing = most <= max(tol.nothing * first, self._least)
+                if increment > tol.slow * last:
+                    expected = min(expected, tol.finer * rtol / self._forcing)
+            last = increment
+            nothing = most <= max(tol.nothing * at_begin, self._least)
             if nothing or (short and rtol <= exact):
                 self._set(end)
                 return
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
-                self._last_increment = min(increment, self._loosest)
+                self._first_increment = min(increment, self._loosest)
             # a model that does not hold along d tells nothing of the next, nor does a place that is
             # one of many
             plain = t < 1.0 or bool(np.any(self._let_go))
             if plain:
-                faster.past.clear()
+                anderson.past.clear()
             plain |= step == 0 or not (self._finite or forms.kept)
-            if not plain:  # else the line search has ended there
-                self._set(faster.next(u, d))
+            if not plain:  # else u is where the line search has ended
+                self._set(anderson.next(u, d))
                 if self._places is not None and self._places.smallest_volume_ratio() <= 0.0:
-                    faster.past.clear()
+                    anderson.past.clear()
                     self._set(u + d)
-            keeps = keeping.next(increment * most, t, tol.near * exact * most)
+            kept = keeping.keeps(forms.kept, increment * most, t, tol.near * exact * most)
             # old places leave a body that is let go a moment, which drives it
-            forms.kept = keeping.kept = keeps and not np.any(self._let_go)
+            forms.kept = kept and not np.any(self._let_go)
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
             f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
@@ -369,14 +369,13 @@ class NonlinearContactProblem(ContactProblem):
         return np.sqrt(found.T).reshape(-1, d.num_bodies, columns)
 
     def _solve_linearised(self, rtol: float, step: int) -> float:
-        """Solve the contact problem of the model at u; return to what rtol. Collective.
+        """Solve the contact problem of the model at u, and return to what rtol. Collective.
 
-        That is the one of the answer where the tangent is that of the last model; the last problem
-        warns. A kept model without an answer, as its places may hold no body that turns, is made
-        anew.
+        That is the answer's where the tangent has the entries of the last one. The first problem
+        warns, and the last. A kept model without an answer, as its places may hold no body that
+        turns, is made anew.
         """
-        u, again = np.array(self.u.x.array), False
-        given, forms = self._settings.options, self._system.forms
+        u, given, forms = np.array(self.u.x.array), self._settings.options, self._system.forms
         self._go_to_places()
         try:
             self._system.look_for_changes()
@@ -385,17 +384,15 @@ class NonlinearContactProblem(ContactProblem):
             atol = max(given.atol, self._last_digit)
             self.options = replace(given, rtol=rtol, atol=atol, warnings=warns)
             self._solve_in_rounds()
+            return rtol
         except TfetiError:  # on all ranks
             if not forms.kept:
                 raise
-            forms.kept = self._keeping.kept = False
-            again = True
         finally:
             forms.known = None
             if self._places is not None:
                 self._places.back()
-        if not again:
-            return rtol
+        forms.kept = False
         self._set(u)
         return self._solve_linearised(rtol, step)
 

@@ -189,11 +189,7 @@ class OnFace:
 
 
 def _solved_on_face(
-    program: LawProgram,
-    on: OnFace,
-    at: LawPoint,
-    share: float,
-    target: float,
+    program: LawProgram, on: OnFace, at: LawPoint, share: float, target: float
 ) -> LawPoint:
     """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0, Gλ = e on a face, λ = λ₁ + (I + C)u, but for a share."""
     qp, comm = program.qp, program.qp.coarse.comm

@@ -192,14 +192,15 @@ class NewtonIteration:
         z: λ and Fλ − d.
         mu: Multipliers μ of Gλ = e, replicated.
         s: Multipliers of Ω, Fλ − d − Gᵀμ: 0 where λ is free, if it is optimal.
-        back: λ̂, the nearest feasible point to λ − ᾱs.
-        pressed: The face of λ̂: a row is open whose force is less than ᾱ times its gap, λ_i < ᾱs_i.
+        lam_hat: λ̂, the nearest feasible point to λ − ᾱs.
+        face_hat: Its face: a row is open whose force is less than ᾱ times its gap, λ_i < ᾱs_i.
             Where forces are rounding of 0 they do not say which rows touch.
-        residual: ‖g^P‖, g^P = (λ − λ̂)/ᾱ.
-        norm: Estimate of ‖F‖; ᾱ is its inverse. rounding: What that may make of ‖g^P‖ alone.
-        least: The last ‖g^P‖ that was half of the one before.
-        idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
-        since: So many have not found ‖g^P‖ half of ``least``.
+        residual: ‖g^P‖, g^P = (λ − λ̂)/ᾱ; infinite before the first look.
+        norm: Estimate of ‖F‖; ᾱ is its inverse.
+        rounding: What rounding of λ − ᾱs may make of ‖g^P‖ alone.
+        halved: The last ‖g^P‖ that was at most half of the ``halved`` before.
+        idle: Looks in a row that have found neither q lower nor ‖g^P‖ halved.
+        not_halved: Looks in a row that have not found ‖g^P‖ halved.
         resume: Whether λ is where PCPG has stopped.
         cautious: Whether rows leave as they block, after q rose, or an end did not balance.
     """
@@ -209,11 +210,10 @@ class NewtonIteration:
     ) -> None:
         self.qp, self.solver, self.parameters = qp, solver, parameters
         self.feasible, self.coarse = qp.feasible, qp.coarse
-        self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
-        self.pressed = qp.feasible.face(z.lam, z.g)
-        self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.since = 0, 0
-        self.resume = self.cautious = False
+        self.z, self.mu, self.s, self.lam_hat = z, mu, z.g, z.lam
+        self.face_hat = qp.feasible.face(z.lam, z.g)
+        self.residual, self.halved, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
+        self.idle, self.not_halved, self.resume, self.cautious = 0, 0, False, False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
@@ -225,24 +225,24 @@ class NewtonIteration:
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
         self.s = self.z.g - normal(self.mu)
         wanted = self.z.lam - self.s / self.norm
-        self.back, alpha = project_onto_feasible(self.coarse, self.feasible, wanted)
+        self.lam_hat, alpha = project_onto_feasible(self.coarse, self.feasible, wanted)
         self.mu = self.mu + self.norm * alpha
         self.s = self.z.g - normal(self.mu)
-        self.pressed = self.feasible.face(self.back, self.s)
-        moved = self.z.lam - self.back
+        self.face_hat = self.feasible.face(self.lam_hat, self.s)
+        moved = self.z.lam - self.lam_hat
         square, size = qp.dot((moved, moved), (self.z.lam, self.z.lam))
         self.residual = self.norm * np.sqrt(square)
         self.rounding = self.parameters.lost * self.norm * np.sqrt(size)
-        self.idle, self.since = self.idle + 1, self.since + 1
-        if self.residual <= 0.5 * self.least:
-            self.least, self.idle, self.since = self.residual, 0, 0
+        self.idle, self.not_halved = self.idle + 1, self.not_halved + 1
+        if self.residual <= 0.5 * self.halved:
+            self.halved, self.idle, self.not_halved = self.residual, 0, 0
 
     def examine(self, rule: StoppingRule) -> ConvergedReason:
         """Apply the stopping rule where ‖g^P‖ is small enough, or hardly falls."""
-        stalls = self.since > 0 and self.since % self.parameters.patience == 0
+        stalls = self.not_halved > 0 and self.not_halved % self.parameters.patience == 0
         if self.residual > max(rule.tolerance, self.rounding) and not stalls:
             return ConvergedReason.ITERATING
-        reason = rule.examine(self.z.lam, self.s, self.pressed, self.residual, self.norm)
+        reason = rule.examine(self.z.lam, self.s, self.face_hat, self.residual, self.norm)
         if reason == ConvergedReason.ITERATING and self.qp.rough is not None:
             self.z = self.z if rule.gradient is None else Point(self.z.lam, rule.gradient)
         return reason
@@ -265,14 +265,14 @@ class NewtonIteration:
         if chopped > self.parameters.gamma**2 * free:
             moved = self.feasible.project(z.lam - beta / self.norm)
             face = self.feasible.face(0.5 * (z.lam + moved), self.s)
-        pressed = self.pressed.status
+        pressed = self.face_hat.status
         early = (face.status == Status.STICK) & (pressed == Status.SLIP)
         if any_rank(self.qp.coarse.comm, face.status >= RUBS):
             early |= (face.status == Status.TOUCHING) & (pressed == Status.OPEN)
         if not any_rank(self.qp.coarse.comm, early):
             return z, face
         self.resume = False
-        return Point(self.back, z.g + self.qp.roughly(self.back - z.lam)), self.pressed
+        return Point(self.lam_hat, z.g + self.qp.roughly(self.lam_hat - z.lam)), self.face_hat
 
     def accept(self, end: Point, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
@@ -290,10 +290,10 @@ class NewtonIteration:
         )
         double, needed = 2.0 * slope - curvature, enough - self.parameters.hidden * hidden
         taken = feasible and 0.5 * double >= needed
-        stuck = self.since >= self.parameters.in_part and slope > 0.0
+        stuck = self.not_halved >= self.parameters.in_part and slope > 0.0
         self.resume = taken
         rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
-        unbalanced = self.since >= self.parameters.in_part and not feasible
+        unbalanced = self.not_halved >= self.parameters.in_part and not feasible
         early = unbalanced or (rose and self.idle < 2)
         self.cautious = self.parameters.cautious and early
         if taken:
@@ -309,12 +309,12 @@ class NewtonIteration:
     def _descend(self) -> bool:
         """Go along λ̂ − λ; return whether q falls."""
         z = self.z
-        p = self.back - z.lam
+        p = self.lam_hat - z.lam
         Fp = self.qp.roughly(p)
         slope, curvature, size = self.qp.dot((-self.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
-        self.solver.directions.seen(curvature, size)
+        self.solver.directions.curves(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         lam = self.feasible.project(z.lam + length * p)
         self._go(Point(lam, z.g + length * Fp), 0.5 * length * slope)
@@ -322,10 +322,9 @@ class NewtonIteration:
 
     def _go(self, to: Point, gain: float) -> None:
         """Move to a point where q is lower by ``gain``."""
-        z = self.z
-        work, load = self.qp.dot((z.lam, z.g), (z.lam, self.qp.d))
+        work, load = self.qp.dot((self.z.lam, self.z.g), (self.z.lam, self.qp.d))
         given, terms = self.parameters, abs(work) + abs(load)
-        if gain > given.hidden * terms and self.since < given.circle:
+        if gain > given.hidden * terms and self.not_halved < given.circle:
             self.idle = 0
         self.z = to
 
@@ -340,6 +339,7 @@ class FaceSolver:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
+        rounds: Runs of PCPG in the last solve, each on a smaller face.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -457,7 +457,7 @@ class FaceSolver:
             if size == 0.0 or curvature > given.rounding * own.norm * square:
                 continue
             way, Fw = self._unseen(way, Fw)
-            if own.seen(*qp.dot((way, Fw), (way, way))):
+            if own.curves(*qp.dot((way, Fw), (way, way))):
                 continue
             # to the first bound, maybe infinite; rounding ends no way
             small = given.rounding * largest(qp.coarse.comm, way)
@@ -556,7 +556,7 @@ def newton(
         mu = multipliers_at(qp, z)
     state = NewtonIteration(qp, solver, parameters, z, mu)
     monitor(steps, "start", z.lam, norm_over(qp.coarse.comm, start.b), 0.0)
-    friction = any_rank(qp.coarse.comm, state.pressed.status >= RUBS)
+    friction = any_rank(qp.coarse.comm, state.face_hat.status >= RUBS)
     reason = ConvergedReason.ITERATING
     if friction and imbalance(qp.coarse, z.lam) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before
@@ -565,7 +565,7 @@ def newton(
     # without friction and an earlier λ the first solve is on the face of the start, as it shows ‖F‖
     looks = start.lam is not None or friction
     while reason == ConvergedReason.ITERATING:
-        first, face = state.z, state.pressed
+        first, face = state.z, state.face_hat
         if looks:
             # Step 1: optimality
             state.look()
@@ -589,7 +589,7 @@ def newton(
         lam=state.z.lam,
         mu=state.mu,
         gradient=state.s,
-        face=state.pressed,
+        face=state.face_hat,
         reason=reason,
         projected_gradient=state.residual,
         equality=qp.coarse.norm_Q(state.z.lam - start.at.lam),

@@ -283,9 +283,9 @@ class FrictionBounds:
         Body by body, as nodal forces of friction: beside forces elsewhere those on a light one
         would not be seen.
         """
-        driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
+        driving = norm_over(self._comm, self._dual.driving) / (self._dual.norm or np.inf)
         most = max(norm_over(self._comm, values), driving)
-        moves_none = float(np.min(self._dual.negligible)) / (self._dual.seen or np.inf)
+        moves_none = float(np.min(self._dual.negligible)) / (self._dual.norm or np.inf)
         self._none = max(PARAMETERS.no_force * most, moves_none)
         self.found = self.forces_of(values)
         if self.stick:
@@ -366,7 +366,7 @@ class NewtonOnLaw:
         if self._first > 0.0 and result.reason > 0:
             enough = result.projected_gradient / max(rule.ratio(), PARAMETERS.finer)
             left = PARAMETERS.looser * enough / self._first
-            self._dual.left = self._rtol, float(steering(self._dual.coarse.comm, left)[0])
+            self._dual.law_target = self._rtol, float(steering(self._dual.coarse.comm, left)[0])
 
     def go_on(
         self, law: tuple[Array, Array], bounds: FrictionBounds, aim: float, looked: bool
@@ -406,8 +406,8 @@ class NewtonOnLaw:
         law = Law(lambda known: dual.law(rows.with_pressures(known)), normals, tangents)
         # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
         Fx = dual.last.image(qp.F, qp.coarse.comm, start[0])
-        dual.seen = dual.seen or seen_norm(qp, Point(start[0], Fx - qp.d))
-        if (norm := dual.seen) == 0.0:
+        dual.norm = dual.norm or seen_norm(qp, Point(start[0], Fx - qp.d))
+        if (norm := dual.norm) == 0.0:
             return None
         # what is made to slip along a row without entries
         drawn = np.any(~rows.contact.moves[at] & (rows.c[tangents] != 0.0), axis=1)
@@ -431,7 +431,7 @@ class NewtonOnLaw:
             target = min(self._rtol * size, PARAMETERS.finer * residual)
         terms = max(norm * norm_over(dual.coarse.comm, start[0]), norm_over(dual.coarse.comm, qp.d))
         if self._first == 0.0:
-            self._first, (rtol, left) = residual, dual.left
+            self._first, (rtol, left) = residual, dual.law_target
             expected = max(left, PARAMETERS.expected * rtol) * residual
             if rtol == self._rtol and expected > PARAMETERS.seen * PARAMETERS.rounding * terms:
                 target = min(target, expected)

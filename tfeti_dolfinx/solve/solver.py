@@ -133,7 +133,7 @@ def solve_dual(
     if broken and dual.rough is not None:
         dual.rough = None  # what single precision does not tell: begin again with F itself
         return solve_dual(dual, options, start, monitor, goal, make_rule)
-    dual.seen = max(dual.seen, result.norm)  # the next start may see far less
+    dual.norm = max(dual.norm, result.norm)  # the next start may see far less
     if dual.coarse.dimension == 0 or qp_type == "newton":
         # what steps leave out of the gradient does not grow from solve to solve, where a look was
         # at the end

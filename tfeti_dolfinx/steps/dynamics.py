@@ -161,7 +161,7 @@ class Predictor:
             if M is not self._M:
                 self.destroy()
                 data = subdomain_data(dofs, M, f, constraints.trace)
-                equals = EqualSubdomains(settings.inverses())
+                equals = EqualSubdomains(settings.inverse_factory())
                 self._subdomains = settings.make_subdomains(data, dofs, equals, tools=bodies)
                 self._M = M
             assert self._subdomains is not None
@@ -271,7 +271,7 @@ class ContactDynamics(ContactProblem):
         self._stabilised, self._lumped = stabilised, lumped
         self._mass, self._velocity = mass, velocity
         super().__init__(a, L, bcs, contacts, decomposition, **others)
-        self._system.how.mixed = False  # many solves come
+        self._system.factory.mixed = False  # many solves come
         if self.options.rtol == "auto":
             raise InputError("rtol auto: errors of steps in time are not estimated; expected one")
         v = np.zeros_like(self.u.x.array)

@@ -35,13 +35,7 @@ from tfeti_dolfinx.common.validation import (
 from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.io.output import POINTS, Series, changing_fields, checked_target, fields_of
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.saved_state import (
-    Table,
-    arranged,
-    labels_of_dofs,
-    rows_of,
-    same_labels,
-)
+from tfeti_dolfinx.saved_state import Table, arranged, as_rows, labels_of_dofs, same_labels
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.steps.checkpoint import Checkpoint
 
@@ -409,7 +403,7 @@ class LoadSteps:
             digest = self._problem.digest()
             labels = labels_of_fields(solution, self._interior) if fields else {}
             table: Table = {
-                name: (rows_of(values, labels[name]), labels[name])
+                name: (as_rows(values, labels[name]), labels[name])
                 for name, values in fields.items()
             }
             self._checkpoint.write(len(self.records), about, record, state, table, digest)

@@ -17,7 +17,7 @@ from tfeti_dolfinx.errors import FactorError
 log = logging.getLogger(__name__)
 
 # in the order of preference
-SOLVERS = ("cholmod", "mumps", "petsc")
+PACKAGES = ("cholmod", "mumps", "petsc")
 # without these an indefinite matrix would pass: CHOLMOD's LDLᵀ takes pivots of any sign, unlike
 # LLᵀ, and MUMPS tells their signs only if it also looks for pivots that are zero
 DEFINITE = {
@@ -121,8 +121,8 @@ def added_options(prefix: str, given: Mapping[str, Any]) -> Iterator[None]:
 
 @cache
 def default_solver() -> str:
-    """Return the first of ``SOLVERS`` that this PETSc has."""
-    return next(solver for solver in SOLVERS if has_solver(solver))
+    """Return the first of ``PACKAGES`` that this PETSc has."""
+    return next(solver for solver in PACKAGES if has_solver(solver))
 
 
 def unread_options(given: Mapping[str, Any], solver: str) -> list[str]:
@@ -164,7 +164,7 @@ def has_solver(solver: str, prefix: str = "") -> bool:
 @cache
 def say_if_not_cholmod() -> None:
     """Log, once, what factors the matrices where PETSc has no CHOLMOD."""
-    if default_solver() != SOLVERS[0]:
+    if default_solver() != PACKAGES[0]:
         log.warning(
             "this PETSc is built without CHOLMOD (SuiteSparse): matrices are factored by %s, which "
             "may be slower",
@@ -216,7 +216,7 @@ def _cause(error: Exception, solver: str, A: PETSc.Mat) -> FactorError:
             f"{A.getInfo()['nz_used']:.0f} entries; expected smaller subdomains, or more memory"
         )
     if code == PetscError.MISSING_SOLVER:
-        known = ", ".join(name for name in SOLVERS if has_solver(name))
+        known = ", ".join(name for name in PACKAGES if has_solver(name))
         return FactorError(
             f"this PETSc makes no Cholesky factors by {solver}; expected one of {known}"
         )

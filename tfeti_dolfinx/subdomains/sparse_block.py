@@ -13,12 +13,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.linalg.lapack import dpocon, dpotrf, dpotri
 
-from tfeti_dolfinx.common.arrays import (
-    TINY,
-    Array,
-    LocalMatrix,
-    as_petsc_matrix,
-)
+from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix, as_petsc_matrix
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import (
@@ -62,10 +57,10 @@ class Stiffness:
         mixed: Whether the factor is in single precision, so that ``roughly`` costs less.
     """
 
-    def __init__(self, name: str, x: Array, K: Any, how: InverseFactory) -> None:
+    def __init__(self, name: str, x: Array, K: Any, factory: InverseFactory) -> None:
         self.product = LocalMatrix(K)  # K, for products
         check_stiffness(name, K, product=self.product)
-        self.name, self.x, self.K, self.how = name, x, K, how
+        self.name, self.x, self.K, self.factory = name, x, K, factory
         self.size = int(K.shape[0])
         self.bs = self.size // max(len(x), 1)
         self._traced: WeakValueDictionary[bytes, Traced] = WeakValueDictionary()
@@ -78,12 +73,12 @@ class Stiffness:
         modes = candidate_modes(x, self.bs, centre, length)
         self.kernel = self.null = R = kernel_of(K, modes)
         outside = outside_motions(modes, R)
-        how.factorizations += 1
+        factory.factorizations += 1
         fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
             # plane ones fit into the cache, as do those that are applied to many vectors at once
-            mixed = how.mixed and x.shape[1] == 3 and outline(x) not in how.shared
-            self._pinv: GeneralisedInverse = how.inverse(K, R, fixing, mixed)
+            mixed = factory.mixed and x.shape[1] == 3 and outline(x) not in factory.shared
+            self._pinv: GeneralisedInverse = factory.inverse(K, R, fixing, mixed)
             self.entries = self.size**2 / 2.0
             if isinstance(self._pinv, CholeskyFactor):
                 self.entries = self._pinv.entries
@@ -92,12 +87,12 @@ class Stiffness:
                 if not self.mixed and gives_no_energy(K, np.hstack((R, outside)), x, self._pinv):
                     raise NotPositiveDefiniteError("a pivot is zero but for rounding")
         except NotPositiveDefiniteError as error:
-            why = why_indefinite(K, R, outside, fixing, x, how.prefix)
+            why = why_indefinite(K, R, outside, fixing, x, factory.prefix)
             raise InputError(f"{name}: {why}") from error
         except FactorError as error:
             raise FactorError(f"{name}: {error}") from error
-        if how.soft:
-            soft = how.soft * float(np.mean(self.diagonal)) * len(x) ** (-2.0 / x.shape[1])
+        if factory.soft:
+            soft = factory.soft * float(np.mean(self.diagonal)) * len(x) ** (-2.0 / x.shape[1])
             self.springs = Springs.of(outside, self.product.__matmul__, soft)
         if self.springs is not None:
             self.kernel = np.hstack((R, self.springs.directions))
@@ -205,14 +200,14 @@ class Traced:
         _, sizes, V = np.linalg.svd(triangle)
         seen = int(np.sum(sizes > TOLERANCES.on_trace * sizes.max(initial=0.0)))
         R = stiffness.null[inside] @ V[seen:].T
-        how, K_ii = stiffness.how, stiffness.product.part(inside, inside)
-        how.factorizations += 1
+        factory, K_ii = stiffness.factory, stiffness.product.part(inside, inside)
+        factory.factorizations += 1
         try:
-            factor = how.factor if stiffness.mixed else CholeskyFactor
+            factor = factory.factor if stiffness.mixed else CholeskyFactor
             if R.shape[1] or stiffness.mixed:
                 K_ii = LocalMatrix(K_ii).entries().csr()
             fixing = fixing_dofs(stiffness.x, inside // stiffness.bs) if R.shape[1] else inside[:0]
-            return regularised(K_ii, R, fixing, how.prefix, factor)
+            return regularised(K_ii, R, fixing, factory.prefix, factor)
         except FactorError as error:
             raise FactorError(
                 f"{stiffness.name}: the stiffness of the unknowns that no constraint touches, for "
@@ -262,7 +257,7 @@ EQUAL = EqualityTolerances()
 class EqualSubdomains:
     """The stiffnesses of a rank, each held once."""
 
-    how: InverseFactory  # makes their inverses
+    factory: InverseFactory  # makes their inverses
     # those that `keep` holds, by names of subdomains
     kept: dict[str, tuple[Stiffness, Traced | None]] = field(default_factory=dict)
     _of_shape: dict[bytes, WeakSet[Stiffness]] = field(default_factory=lambda: defaultdict(WeakSet))
@@ -289,7 +284,7 @@ class EqualSubdomains:
                 return stiffness, here
             del stiffness
         self.kept.pop(name, None)  # its factors go before others are made
-        made = Stiffness(name, x, K, self.how)
+        made = Stiffness(name, x, K, self.factory)
         known.add(made)
         return made, np.arange(K.shape[0], dtype=np.int32)
 
@@ -341,10 +336,10 @@ class SparseBlock(Block):
     def __init__(
         self,
         data: SubdomainData,
-        how: InverseFactory | None = None,
+        factory: InverseFactory | None = None,
         equals: EqualSubdomains | None = None,
     ) -> None:
-        self._how, self.equals = how or InverseFactory(), equals
+        self._factory, self.equals = factory or InverseFactory(), equals
         super().__init__(data)
 
     def set_stiffness(self, K: Any) -> None:
@@ -363,19 +358,19 @@ class SparseBlock(Block):
         """Return a Stiffness of K, and the place of each unknown in it; boundary elements' else."""
         if self.equals is not None:
             return self.equals.find(self.name, self.x, K)
-        return Stiffness(self.name, self.x, K, self._how), np.arange(K.shape[0])
+        return Stiffness(self.name, self.x, K, self._factory), np.arange(K.shape[0])
 
     def multiply(self, u: Array) -> Array:
         """K u on all unknowns, shapes ``(n,)``."""
-        return (self.stiffness.product @ placed(u, self.place))[self.place]
+        return (self.stiffness.product @ scattered(u, self.place))[self.place]
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)``."""
-        return self.stiffness.solve(placed(b, self.place))[self.place]
+        return self.stiffness.solve(scattered(b, self.place))[self.place]
 
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)``; K_ii is factored once."""
-        return self.traced.apply_schur(placed(w, self.trace_rows))[self.trace_rows]
+        return self.traced.apply_schur(scattered(w, self.trace_rows))[self.trace_rows]
 
     def prepare(self, kind: OperatorKind) -> None:
         """Factor K_ii for ``"schur"``, where S is not known from a dense K⁺."""
@@ -404,7 +399,7 @@ class SparseBlock(Block):
         return np.searchsorted(self.traced.trace, self.place[self.trace_dofs])
 
 
-def placed(x: Array, places: Array) -> Array:
+def scattered(x: Array, places: Array) -> Array:
     """Return y with ``y[places] = x``."""
     y = np.empty(x.shape)
     y[places] = x

@@ -29,11 +29,7 @@ from tfeti_dolfinx.subdomains.block import (
     candidate_modes,
 )
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.local_operators import (
-    GroupedOperator,
-    LocalChoice,
-    LocalOperator,
-)
+from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalChoice, LocalOperator
 
 # --- All subdomains of a rank -----------------------------------------------------------------
 
@@ -50,7 +46,7 @@ class Subdomains:
         elastic: The Blocks that have nodes, which are no rigid bodies, and num_nodal the number of
             their unknowns; those behind are of rigid bodies.
         num_modes: k; num_springs and num_clusters: springs and clusters on all ranks.
-        tangents: Whether stiffnesses are tangents of nonlinear materials.
+        is_tangent: Whether stiffnesses are tangents of Newton's method.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         elastic_parts: Each of the Blocks that have nodes, with its part of the n unknowns.
         size: n.
@@ -62,7 +58,7 @@ class Subdomains:
     """
 
     num_clusters = 0
-    tangents = False
+    is_tangent = False
 
     def __init__(
         self,
@@ -312,7 +308,7 @@ class FiniteElements:
     def __init__(self, dofs: TornDofs) -> None:
         self._dofs = dofs
 
-    def node_blocks(self, K: Any, how: InverseFactory) -> Array:
+    def node_blocks(self, K: Any, factory: InverseFactory) -> Array:
         """Return the stiffness's block of each primal node, shape ``(num_nodes, bs, bs)``.
 
         K is the stiffness of finite elements in DOLFINx's numbering, scipy CSR.
