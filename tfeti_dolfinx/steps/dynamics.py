@@ -494,6 +494,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         if self._places is not None:  # the prediction is that of the begin of the step
             self._set(self._begin)
             self._go_to_places()
+            self._system.change("places")  # else a law that moves a tool may leave its place
         try:
             self._system.look_for_changes()
             self._set_out()
