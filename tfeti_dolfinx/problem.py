@@ -503,7 +503,7 @@ class ContactProblem:
         (reach, _), dual = self._system.search.rows(), self._system.dual
         state = SavedState.of(solution, start[2], dual, reach)
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
-        if dual.constraints is not start[0].constraints:
+        if dual.constraints.B is not start[0].constraints.B:
             return state
         state = replace(state, image=dual.last.multiple(self.dofs.comm, start[1]))
         kept = dual.recycled
