@@ -37,6 +37,7 @@ class Thrown:
         thrown=(0.3, 0.1, 0.05),
         begin=0.0,
         subdomains=4,
+        reach=1.0,
         **keywords,
     ):
         d = stacked(cell, 2, 3, 4, gap=gap) if below else decomposed(cell, n, subdomains)
@@ -51,7 +52,7 @@ class Thrown:
         plane = tfeti.Plane(low * up, up)
         plane = tfeti.RigidBody(plane, displacement=(-begin, 0.0)) if begin else plane
         bottom = "lower bottom" if below else "bottom"
-        contacts = [tfeti.Obstacle(bottom, plane, friction=friction, reach=1.0, name="plane")]
+        contacts = [tfeti.Obstacle(bottom, plane, friction=friction, reach=reach, name="plane")]
         if below:
             contacts.append(tfeti.Contact("upper bottom", "lower top", reach=1.0))
         own = {k: keywords.pop(k) for k in ("mass", "stabilised", "lumped") if k in keywords}
@@ -65,9 +66,6 @@ class Thrown:
 
     def step(self, size, count=1):
         """Go on, and give the reports of the steps."""
-        found = []
         self.problem.take_step(size)
-        for _ in range(count):
-            accepted(self.problem)
-            found.append((dict(self.problem.report.motion), self.problem.report.contact_forces))
-        return found
+        reports = (accepted(self.problem) for _ in range(count))
+        return [(dict(report.motion), report.contact_forces) for report in reports]

@@ -200,6 +200,7 @@ def series(tmp_path_factory):
     [
         (1, "smooth", "committed"),
         (2, "rough", "between"),
+        (2, "coulomb", "committed"),
         (1, "stabilised", "committing"),
         pytest.param(2, "rough", "writing", marks=pytest.mark.slow),
         pytest.param(2, "thrown", "committing", marks=pytest.mark.slow),

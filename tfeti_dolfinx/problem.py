@@ -500,7 +500,7 @@ class ContactProblem:
         (reach, _), dual = self._system.search.rows(), self._system.dual
         state = SavedState.of(solution, start.mu, dual, reach)
         state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
-        if dual.constraints is not start.gluing.constraints:
+        if dual.constraints.B is not start.gluing.constraints.B:
             return state
         state = replace(state, image=dual.last.multiple(self.dofs.comm, start.lam))
         kept = dual.recycled

@@ -134,15 +134,16 @@ class Predictor:
         self.multiplications = 0
         self.last: tuple[Array, Face] | None = None
 
-    @property
-    def start(self) -> tuple[Array, Array]:
-        """Multipliers that the next call starts from, and their image. Collective.
+    def start(self, gluing: Gluing) -> tuple[Array, Array]:
+        """Return multipliers of rows that the next call starts from, and their image. Collective.
 
-        Empty before the first, or where the image is not known.
+        Empty before the first, or where the image is not known, as of rows that are new.
         """
         if self.rows_and_start is None or self._dual is None:
             return np.zeros(0), np.zeros(0)
-        lam = self.rows_and_start[1]
+        before, lam = self.rows_and_start
+        if before.constraints is not gluing.constraints:
+            return gluing.multipliers(before, lam), np.zeros(0)
         return lam, self._dual.last.multiple(self._dofs.comm, lam)
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing, tools: Tools) -> Array:
@@ -355,9 +356,9 @@ class ContactDynamics(ContactProblem):
         tools = self._system.tools
         state = replace(state, velocity=v, load=load, size=np.array(motion.size))
         state = replace(state, tool_speed=tools.speed, tool_loads=tools.loads_at_begin)
-        if self._predictor is None:
+        if self._predictor is None or self._accepted is None:
             return state
-        predicted, image = self._predictor.start
+        predicted, image = self._predictor.start(self._accepted[0].gluing)
         return replace(state, predicted=predicted, predicted_image=image)
 
     def restore(self, state: SavedState) -> None:
@@ -493,6 +494,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         if self._places is not None:  # the prediction is that of the begin of the step
             self._set(self._begin)
             self._go_to_places()
+            self._system.change("places")  # else a law that moves a tool may leave its place
         try:
             self._system.look_for_changes()
             self._set_out()
