@@ -178,28 +178,23 @@ def write_documents(name: str, tables: Tables, commit: str, folder: Path = ROOT 
             path.write_text(made)
 
 
-def started(words: Sequence[object], ranks: int, **environment: str) -> str:
-    """What a program prints, run on so many ranks in processes of its own.
+def json_of(words: Sequence[object], ranks: int) -> Any:
+    """The JSON that a program writes where ``FILE`` stands among its words, run on so many ranks.
 
     Raises:
         RuntimeError: This process is one of several itself, or the program fails.
     """
     if any(int(os.environ.get(variable, 1)) > 1 for variable in MPI_VARIABLES):
         raise RuntimeError("this benchmark starts mpirun itself; run it without")
-    command = ["mpirun", "-n", *map(str, (ranks, *words))]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    if done.returncode != 0:
-        said = "\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:])
-        raise RuntimeError(f"{' '.join(command)} failed:\n{said}")
-    return done.stdout
-
-
-def json_of(words: Sequence[object], ranks: int, **environment: str) -> Any:
-    """The JSON that a program writes where ``FILE`` stands among its words, run as ``started``."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "found.json"
-        started([file if word is FILE else word for word in words], ranks, **environment)
+        words = [file if word is FILE else word for word in words]
+        command = ["mpirun", "-n", *map(str, (ranks, *words))]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        if done.returncode != 0:
+            said = "\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:])
+            raise RuntimeError(f"{' '.join(command)} failed:\n{said}")
         return json.loads(file.read_text())
 
 
@@ -209,15 +204,11 @@ def run_demo(name: str, arguments: Sequence[object], ranks: int) -> dict[str, An
     It also has seconds of the ``processor``: of all ranks, start and mesh included. On a machine
     that others use, too, they say more than those of the wall, but for waiting for each other.
     """
-    before = processor_seconds()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     demo = [sys.executable, ROOT / "demos" / f"{name}.py", *arguments, "--report", FILE]
-    return {**json_of(demo, ranks), "processor": processor_seconds() - before}
-
-
-def processor_seconds() -> float:
-    """Of all processes that this one has started and waited for."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    report, after = json_of(demo, ranks), resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {**report, "processor": seconds}
 
 
 def best_runs(
