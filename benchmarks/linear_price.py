@@ -35,6 +35,7 @@ from benchmarks.tools import (
     stacked,
 )
 from demos import petsc_options, scene
+from tfeti_dolfinx.common.parallel import largest
 from tfeti_dolfinx.forms.assembly import Forms
 
 # --- The linear problem of a contact's solution on the untorn mesh ------------------------------
@@ -72,8 +73,7 @@ class Linear:
 
     def error(self, x):
         """Largest error of a solution, in terms of the largest displacement. Collective."""
-        own = np.abs(x.array_r - self.reference).max(initial=0.0)
-        return float(self.A.getComm().tompi4py().allreduce(own, op=MPI.MAX) / self.scale)
+        return largest(self.A.getComm().tompi4py(), x.array_r - self.reference) / self.scale
 
 
 def linear_problem(made, solution):
@@ -97,8 +97,8 @@ def linear_problem(made, solution):
     A.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0, x, b)
     b.array[held.ravel()] = 0.0
     x.destroy()
-    scale = comm.allreduce(np.abs(u).max(initial=0.0), op=MPI.MAX)
-    return Linear(A, b, np.where(held, 0.0, u).ravel(), scale, comm.allreduce(seconds, op=MPI.MAX))
+    reference, seconds = np.where(held, 0.0, u).ravel(), comm.allreduce(seconds, op=MPI.MAX)
+    return Linear(A, b, reference, largest(comm, u), seconds)
 
 
 def untorn(K, dofs):

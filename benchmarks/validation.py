@@ -21,7 +21,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-from benchmarks.elastic import Elastic
+from benchmarks.elastic import Elastic, gathered
 from benchmarks.pressures import LineContact, PointContact, fit
 from benchmarks.tools import Tables, command_line, finish, say
 from demos import run
@@ -29,6 +29,7 @@ from demos import scene as scene_of
 from meshes import blocks, cylinder_on_block
 from meshes.rings import lame_pressure, rings
 from meshes.tools import graded_size, started_model, torn
+from tfeti_dolfinx.common.parallel import largest
 
 COMM = MPI.COMM_WORLD
 # sizes of elements, over those of the quick run
@@ -271,8 +272,7 @@ def patches(scale: float) -> Iterator[Row]:
         problem = scene.problem([tfeti.Contact("upper bottom", "lower top")], rtol=1e-10)
         problem.solve()
         data = problem.solution.contact()
-        worst = np.max(np.abs(data.pressure - pressure), initial=0.0)
-        worst = COMM.allreduce(worst, op=MPI.MAX)
+        worst = largest(COMM, data.pressure - pressure)
         case = f"{'SSNP121' if gdim == 2 else 'SSNV167'}, patch test"
         yield figure(case, "pressure, worst node", pressure, pressure + worst, 1e-6, problem)
 
@@ -322,8 +322,7 @@ def loaded_pin(scale: float) -> Iterator[Row]:
         data = problem.solution.contact()
         own = np.degrees(np.arctan2(data.points[:, 1], data.points[:, 0]))
         slip = np.linalg.norm(data.tangential_traction.reshape(len(own), -1), axis=1)
-        parts = COMM.allgather((own, data.pressure, slip))
-        angle, pressure, slip = (np.concatenate(part) for part in zip(*parts, strict=True))
+        angle, pressure, slip = gathered(own, data.pressure, slip)
         order = np.argsort(angle)
         angle, pressure, slip = angle[order], pressure[order], slip[order]
         figures = {f"pressure at {at}°": np.interp(at, angle, pressure) for at in (0, 30, 60)}
