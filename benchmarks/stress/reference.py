@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from dolfinx import fem
-from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scipy.sparse import csr_array, diags_array
 
@@ -21,7 +20,6 @@ from benchmarks.stress.conditions import conditions
 from benchmarks.stress.scene import Scene, Side
 from benchmarks.stress.sliding import Law, solve_sliding
 from benchmarks.stress.solve import DEPENDENT, EPSILON, UnsettledError, null_space, solve, verdict
-from tfeti_dolfinx.common.compat import geometry_dofmap
 
 SMALLEST = 2.5e-9  # of the largest displacement: a body has no less, 2.5e-13 of all being rounding
 NO_WORK = 1e-13  # of all loads: rounding
@@ -69,12 +67,9 @@ class Untorn:
 
     def __init__(self, scene: Scene, g: meshes.Grid, mu: np.ndarray, lmbda: np.ndarray) -> None:
         self.scene, self.gdim = scene, scene.gdim
-        mesh = meshes.make_mesh(scene, g, MPI.COMM_SELF)
-        cell = np.asarray(mesh.topology.original_cell_index)
-        tags = meshes.tag_sides(scene, mesh, g.body[cell])
-        meshes.bend(scene, mesh)
-        loads = meshes.loads_of(scene)[g.body[cell]]
-        V, a, L = meshes.elasticity(scene, mesh, tags, mu[cell], lmbda[cell], loads)
+        mesh, tags, cell = meshes.make_mesh(scene, g, MPI.COMM_SELF)
+        of_cells = (values[cell] for values in (mu, lmbda, meshes.loads_of(scene, g)))
+        V, a, L = meshes.elasticity(scene, mesh, tags, *of_cells)
         K = fem.assemble_matrix(fem.form(a), block_mode=None).to_scipy()
         self.K, self.f = csr_array(K), fem.assemble_vector(fem.form(L)).array.copy()
         self.x = V.tabulate_dof_coordinates()
@@ -82,9 +77,6 @@ class Untorn:
         cells = V.dofmap.list
         self.body[cells] = g.body[cell][:, None]
         self._mesh, self._tags, self._V = mesh, tags, V
-        self._dof = np.zeros(len(mesh.geometry.x), dtype=int)
-        corners = geometry_dofmap(mesh)
-        self._dof[corners] = cells[:, : corners.shape[1]]
         self._nodes_of = [np.unique(cells[g.body[cell] == b]) for b in range(len(scene.bodies))]
         self.fixed, self.values = np.zeros(len(self.f), dtype=bool), np.zeros(len(self.f))
         for bc in meshes.prescribed(scene, V, self._facets):
@@ -102,20 +94,17 @@ class Untorn:
 
     def _facet_nodes(self, side: Side) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and all nodes of the facets of a side."""
-        mesh, fdim, facets = self._mesh, self.gdim - 1, self._facets(side)
-        vertices = self._dof[dmesh.entities_to_geometry(mesh, fdim, facets)]
-        if self.scene.order == 1:
-            return vertices, vertices
-        mesh.topology.create_connectivity(fdim, fdim + 1)
-        mesh.topology.create_connectivity(fdim + 1, fdim)
-        own, every = mesh.topology.connectivity(fdim, fdim + 1), []
-        of_cells = mesh.topology.connectivity(fdim + 1, fdim)
-        layout = self._V.dofmap.dof_layout
-        for facet in facets:
-            cell = own.links(facet)[0]
-            local = int(np.flatnonzero(of_cells.links(cell) == facet)[0])
-            every.append(self._V.dofmap.list[cell][layout.entity_closure_dofs(fdim, local)])
-        return vertices, np.array(every)
+        topology, fdim, nodes = self._mesh.topology, self.gdim - 1, []
+        topology.create_connectivity(fdim + 1, fdim)
+        cell_of = topology.connectivity(fdim, fdim + 1)
+        facets_of = topology.connectivity(fdim + 1, fdim)
+        for facet in self._facets(side):
+            cell = cell_of.links(facet)[0]
+            local = int(np.flatnonzero(facets_of.links(cell) == facet)[0])
+            on_facet = self._V.dofmap.dof_layout.entity_closure_dofs(fdim, local)
+            nodes.append(self._V.dofmap.list[cell][on_facet])  # vertices first
+        corners = fdim + 1 if self.scene.cell in meshes.SPLIT else 2**fdim
+        return np.array(nodes)[:, :corners], np.array(nodes)
 
     def rigid_motions(self) -> np.ndarray:
         """Motions of bodies that prescribed values and hinges leave, largest about 1."""
