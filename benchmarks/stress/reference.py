@@ -127,10 +127,9 @@ class Untorn:
             held.append(np.repeat(np.isin(np.arange(len(self.x)), nodes), gdim))
         return _hinged(out, held)
 
-    def _slid(self, known: Answer, free: np.ndarray) -> None:
-        """The answer where there is friction."""
-        c = self.conditions
-        f = self.f - self.K @ self.values
+    def _slid(self, known: Answer, K: csr_array, f: np.ndarray, gap: np.ndarray) -> None:
+        """The answer where there is friction: K, loads and gaps of the free unknowns are given."""
+        c, free = self.conditions, ~self.fixed
         size = (np.asarray(abs(A).sum(axis=1)) for A in (c.T[:, free], c.T))
         # on a plane of symmetry nothing slips across, whatever other nodes leave of a row
         slips = np.divide(*size) > LITTLE
@@ -141,16 +140,9 @@ class Untorn:
         moves = np.asarray(abs(c.N[:, free]).sum(axis=1)).ravel() > DEPENDENT
         moves |= (c.given > 0.0) & (size > DEPENDENT)
         along = np.repeat(moves, T.shape[0] // len(moves))
-        K, gap = self.K[free][:, free], c.gap[moves] - c.N[moves] @ self.values
-        law = Law(
-            c.N[moves][:, free],
-            T[along],
-            gap,
-            slip[along] @ self.values,
-            c.given[moves],
-            c.coefficient[moves],
-        )
-        u, lam, tau = solve_sliding(K, f[free], law)
+        N, gap, slipped = c.N[moves][:, free], gap[moves], slip[along] @ self.values
+        law = Law(N, T[along], gap, slipped, c.given[moves], c.coefficient[moves])
+        u, lam, tau = solve_sliding(K, f, law)
         known.free = np.zeros((len(self.f), 0))
         known.u = self._smallest(u, known.free)
         force = c.N[moves].T @ lam + slip[along].T @ tau.ravel()
@@ -158,7 +150,7 @@ class Untorn:
         known.noise = np.zeros(len(self.scene.bodies))
         K, gap = self._shaken(known, K, c.N[moves], gap)
         with contextlib.suppress(UnsettledError):
-            u, *_ = solve_sliding(K, f[free], replace(law, gap=gap))
+            u, *_ = solve_sliding(K, f, replace(law, gap=gap))
             known.noise = body_errors(known, self._smallest(u, known.free))
 
     def _shaken(
@@ -178,20 +170,18 @@ class Untorn:
         """Verdict and solution."""
         known = Answer("", self.x, self.body, self.rows, self.gap, np.abs(self.f).sum())
         free = ~self.fixed
-        f = self.f[free] - self.K[free][:, self.fixed] @ self.values[self.fixed]
-        N = self.rows[:, free]
-        gap = self.gap - self.rows[:, self.fixed] @ self.values[self.fixed]
+        K, f = self.K[free][:, free], (self.f - self.K @ self.values)[free]
+        N, gap = self.rows[:, free], self.gap - self.rows @ self.values
         R = self.rigid_motions()[free]
         weight = np.sqrt(N.multiply(N).sum(axis=1)) if N.shape[0] else np.zeros(0)
         known.verdict = verdict(N, gap, R, self.f[free], weight, self.length)
         if self.conditions.has_friction:
             known.verdict = "solvable"
-            self._slid(known, free)
+            self._slid(known, K, f, gap)
         if known.verdict != "solvable" or known.u is not None:
             return known
         used = (weight > DEPENDENT) & _first(self.rows, self.gap)
         N, gap = N[used], gap[used]
-        K = self.K[free][:, free]
         e = R.T @ self.f[free]
         e[np.abs(e) <= NO_WORK * known.load] = 0.0
         lam, u, rigid = solve(K, f, N, gap, R, e)
