@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -277,13 +278,11 @@ def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iter
 
 def stacked(axes: Any, title: str, rows: Sequence[Mapping[str, Any]], parts: Sequence[str]) -> None:
     """A bar for each row, labelled with its first column, made of columns that are seconds."""
-    labels = [str(next(iter(row.values()))) for row in rows]
-    left = [0.0] * len(rows)
+    labels, left = [str(next(iter(row.values()))) for row in rows], np.zeros(len(rows))
     for part in parts:
-        widths = [float(row[part]) for row in rows]
-        axes.barh(range(len(rows)), widths, left=left, label=part)
-        left = [a + b for a, b in zip(left, widths, strict=True)]
-    axes.set_yticks(range(len(rows)), labels)
+        widths = np.array([row[part] for row in rows])
+        axes.barh(labels, widths, left=left, label=part)
+        left += widths
     axes.invert_yaxis()
     axes.set_xlim(0.0, 1.3 * max(left))  # room for the legend
     axes.set_xlabel("seconds")
