@@ -105,12 +105,15 @@ def plans() -> dict[str, tuple[list[Case], Case]]:
         fine = Case(name, (finest,), degree=2, order=order, rtol=1e-7)
         found[name] = [case for group in groups for case in group], fine
 
-    name = "half cylinder"
-    straight, squares = both(name, sizes, order=1)[1:], both(name, sizes, cell=QUADRILATERAL)
-    uniform = both(name, (1.0, 2.0, 4.0, 6.0), mesh=UNIFORM)
-    uniform.append(Case(name, (0.3, 0.15, 0.08, 0.04), ADAPTIVE))
-    two = both(name, sizes, ranks=2)
-    plan(name, 64.0, 2, both(name, sizes), straight, squares, uniform, two)
+    for name, everywhere, goals in (
+        ("half cylinder", (1.0, 2.0, 4.0, 6.0), (0.3, 0.15, 0.08, 0.04)),
+        ("cylinder on block", (1.0, 2.0, 4.0), ()),
+    ):
+        straight, squares = both(name, sizes, order=1)[1:], both(name, sizes, cell=QUADRILATERAL)
+        uniform = both(name, everywhere, mesh=UNIFORM)
+        uniform += [Case(name, goals, ADAPTIVE)] if goals else []
+        two = both(name, sizes, ranks=2)
+        plan(name, 64.0, 2, both(name, sizes), straight, squares, uniform, two)
 
     name, few = "half ball", (4.0, 6.0, 10.0)
     first = [Case(name, (*few, 16.0)), both(name, few)[1]]
@@ -126,11 +129,6 @@ def plans() -> dict[str, tuple[list[Case], Case]]:
     kinds = {}, {"cell": QUADRILATERAL}, {"ranks": 2}
     # of no mesh a refinement: their midpoints are better
     plan(name, 90.0, 2, *(both(name, around, mesh=UNIFORM, **kind) for kind in kinds))
-
-    name = "cylinder on block"
-    straight, squares = both(name, sizes, order=1)[1:], both(name, sizes, cell=QUADRILATERAL)
-    uniform, two = both(name, (1.0, 2.0, 4.0), mesh=UNIFORM), both(name, sizes, ranks=2)
-    plan(name, 64.0, 2, both(name, sizes), straight, squares, uniform, two)
     return found
 
 
