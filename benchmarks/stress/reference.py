@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from dolfinx import fem
@@ -222,19 +223,13 @@ def _first(N: csr_array, gap: np.ndarray) -> np.ndarray:
 
 def _hinged(motions: list[np.ndarray], of_body: list[np.ndarray]) -> np.ndarray:
     """Of motions of bodies those that agree where bodies share nodes."""
-    shared = np.sum(of_body, axis=0) > 1
-    if not shared.any():
-        return np.concatenate(motions, axis=1)
-    differ = []
-    for i in range(len(motions)):
-        for j in range(i):
-            rows = of_body[i] & of_body[j]
-            parts = [np.zeros((rows.sum(), m.shape[1])) for m in motions]
-            parts[i], parts[j] = motions[i][rows], -motions[j][rows]
-            differ.append(np.concatenate(parts, axis=1))
-    once = np.concatenate([m / np.sum(of_body, axis=0)[:, None] for m in motions], axis=1)
-    whole = np.concatenate(motions, axis=1)
-    whole[shared] = once[shared]
+    whole = np.concatenate(motions, axis=1) / np.sum(of_body, axis=0)[:, None]
+    differ = [np.zeros((0, whole.shape[1]))]
+    for j, i in combinations(range(len(motions)), 2):
+        rows = of_body[i] & of_body[j]
+        parts = [np.zeros((rows.sum(), m.shape[1])) for m in motions]
+        parts[i], parts[j] = motions[i][rows], -motions[j][rows]
+        differ.append(np.concatenate(parts, axis=1))
     return whole @ null_space(np.concatenate(differ))
 
 
