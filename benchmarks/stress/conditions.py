@@ -32,10 +32,11 @@ class Conditions:
     """All conditions of a scene."""
 
     N: csr_array  # shape ``(c, n)``
-    T: csr_array  # along tangents, gdim − 1 rows of each condition, one after the other
+    T: csr_array  # slips T u + slip, gdim − 1 rows of each condition, one after the other
     gap: np.ndarray  # shape ``(c,)``
     given: np.ndarray  # largest tangential forces, by Tresca's law
     coefficient: np.ndarray  # of Coulomb's law
+    slip: np.ndarray | None = None  # of prescribed values, where u are the free unknowns alone
 
     @property
     def has_friction(self) -> bool:

@@ -17,9 +17,9 @@ from mpi4py import MPI
 from scipy.sparse import csr_array, diags_array
 
 from benchmarks.stress import meshes
-from benchmarks.stress.conditions import conditions
+from benchmarks.stress.conditions import Conditions, conditions
 from benchmarks.stress.scene import Scene, Side
-from benchmarks.stress.sliding import Law, solve_sliding
+from benchmarks.stress.sliding import solve_sliding
 from benchmarks.stress.solve import DEPENDENT, EPSILON, UnsettledError, null_space, solve, verdict
 
 SMALLEST = 2.5e-9  # of the largest displacement: a body has no less, 2.5e-13 of all being rounding
@@ -142,7 +142,7 @@ class Untorn:
         moves |= (c.given > 0.0) & (size > DEPENDENT)
         along = np.repeat(moves, T.shape[0] // len(moves))
         N, gap, slipped = c.N[moves][:, free], gap[moves], slip[along] @ self.values
-        law = Law(N, T[along], gap, slipped, c.given[moves], c.coefficient[moves])
+        law = Conditions(N, T[along], gap, c.given[moves], c.coefficient[moves], slipped)
         u, lam, tau = solve_sliding(K, f, law)
         known.free = np.zeros((len(self.f), 0))
         known.u = self._smallest(u, known.free)
