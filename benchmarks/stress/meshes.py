@@ -68,11 +68,10 @@ def make_mesh(
     links = mesh.topology.connectivity(tdim - 1, tdim)
     body = g.body[cell[np.array([links.links(f)[0] for f in facets], dtype=int)]]
     middle = dmesh.compute_midpoints(mesh, tdim - 1, facets)[:, :tdim]
-    low = np.array([b.low for b in scene.bodies])[body].reshape(-1, tdim)
-    high = np.array([b.high for b in scene.bodies])[body].reshape(-1, tdim)
+    low, high = np.array([(b.low, b.high) for b in scene.bodies])[body].swapaxes(0, 1)
     # a facet's midpoint is on its own side, and half a cell away from all others
     away = np.stack((middle - low, high - middle), axis=2) / (high - low)[:, :, None]
-    side = np.abs(away).reshape(len(facets), -1).argmin(axis=1) if len(facets) else body
+    side = np.abs(away).reshape(-1, 2 * tdim).argmin(axis=1)
     tags = (body * 2 * tdim + side + 1).astype(np.int32)
     if scene.bent is not None:
         kind, strength = scene.bent
@@ -117,8 +116,8 @@ def elasticity(
     V = fem.functionspace(mesh, ("Lagrange", scene.order, (gdim,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     mu, lmbda, t = (cellwise(mesh, values) for values in of_cells)
-    flat = len(SPLIT.get(scene.cell, [])) > 0
-    quadrature = {"quadrature_degree": (1 if flat else 2) if scene.order == 1 else 4}
+    linear = 1 if scene.cell in SPLIT else 2
+    quadrature = {"quadrature_degree": linear if scene.order == 1 else 4}
     dx = ufl.Measure("dx", domain=mesh, metadata=quadrature)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=facet_tags, metadata=quadrature)
     e, n = ufl.sym(ufl.grad(u)), ufl.FacetNormal(mesh)

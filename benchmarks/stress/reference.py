@@ -18,7 +18,7 @@ from scipy.sparse import csr_array, diags_array
 
 from benchmarks.stress import meshes
 from benchmarks.stress.conditions import Conditions, conditions
-from benchmarks.stress.scene import Scene, Side
+from benchmarks.stress.scene import Scene, Side, side_name
 from benchmarks.stress.sliding import solve_sliding
 from benchmarks.stress.solve import DEPENDENT, EPSILON, UnsettledError, null_space, solve, verdict
 
@@ -90,8 +90,7 @@ class Untorn:
         self.length = float(min(box.max() for box in boxes))
 
     def _facets(self, side: Side) -> np.ndarray:
-        body, axis, end = side
-        return self._tags.find(body * 2 * self.gdim + 2 * axis + end + 1)
+        return self._tags.find(self.scene.surfaces[side_name(side)])
 
     def _facet_nodes(self, side: Side) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and all nodes of the facets of a side."""

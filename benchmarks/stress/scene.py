@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -117,12 +118,7 @@ class Scene:
     @property
     def surfaces(self) -> dict[str, int]:
         """Names of all sides of all bodies, with their tags."""
-        sides = [
-            (b, axis, end)
-            for b in range(len(self.bodies))
-            for axis in range(self.gdim)
-            for end in (0, 1)
-        ]
+        sides = product(range(len(self.bodies)), range(self.gdim), (0, 1))
         return {side_name(side): tag for tag, side in enumerate(sides, start=1)}
 
 
