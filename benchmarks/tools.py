@@ -260,7 +260,6 @@ def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iter
 
     Panels of one row that are more than three are drawn in two columns.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     count = rows * panels
@@ -268,7 +267,6 @@ def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iter
         panels, rows = 2, -(-panels // 2)
         height *= rows
     figure = Figure(figsize=(4.6 * panels, height), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, panels, squeeze=False).ravel())
     for unused in axes[count:]:
         unused.remove()
@@ -284,8 +282,7 @@ def stacked(axes: Any, title: str, rows: Sequence[Mapping[str, Any]], parts: Seq
         axes.barh(labels, widths, left=left, label=part)
         left += widths
     axes.invert_yaxis()
-    axes.set_xlim(0.0, 1.3 * max(left))  # room for the legend
-    axes.set_xlabel("seconds")
+    axes.set(xlim=(0.0, 1.3 * max(left)), xlabel="seconds")  # room for the legend
     axes.set_title(title, fontsize="medium")
     axes.legend(fontsize="small")
 
@@ -311,8 +308,7 @@ def curves(
         plain(axes.yaxis)
     else:
         axes.set_ylim(0.0, 1.4 * max(max(y) for _, y in lines.values()))  # room for the legend
-    axes.set_xlabel(labels[0])
-    axes.set_ylabel(labels[1])
+    axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.set_title(title, fontsize="medium")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", **(BELOW if len(lines) > 4 or names else {}))
@@ -323,12 +319,12 @@ def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
 
     Of a horizontal axis of more than two decades, another one of more than three, 1, 10, 100, ...
     """
-    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import FixedLocator, LogLocator
 
     short = ticks is not None and max(ticks) < 1000 and len(ticks) <= FEW
     low, high = axis.get_data_interval()
     wide = high > (1e2 if axis.axis_name == "x" else 1e3) * low
     few = LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0))
     axis.set_major_locator(FixedLocator(ticks) if short else few)
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.minorticks_off()
+    axis.set_major_formatter("{x:g}")
