@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
+from unittest.mock import patch
 
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -87,34 +88,31 @@ def counted() -> Iterator[Counts]:
             counts.reasons[report.converged_reason] += 1
             counts.u = float(problem.u.x.petsc_vec.norm())
 
-    ContactProblem.solve = solve_and_count
-    try:
+    with patch.object(ContactProblem, "solve", solve_and_count):
         yield counts
-    finally:
-        ContactProblem.solve = solve
 
 
 def run(scene: str, without: str) -> Counts:
     """Run a demo or a rung without a mechanism; what it raises stands among the reasons."""
     name, *words = scene.split()
-    options, known = PETSc.Options(), PARTITIONERS["round"]
+    round_parts = "bisection" if without == "round_parts" else "round"
+    options = PETSc.Options()
     options.setValue("-tfeti_without", without if without in MECHANISMS else "")
-    if without == "round_parts":
-        PARTITIONERS["round"] = PARTITIONERS["bisection"]
-    try:
-        with counted() as counts, contextlib.redirect_stdout(io.StringIO()):
-            try:
-                if name == "ladder":
-                    title, cell, value = scene.removeprefix("ladder ").split(", ")
-                    (ladder,) = (one for one in LADDERS if one.name == title)
-                    run_scene(ladder.rung(cell, float(value)), MPI.COMM_WORLD)
-                else:
-                    demos.names_of(name, words)
-            except Exception as error:
-                counts.reasons[type(error).__name__] += 1
-    finally:
-        options.delValue("-tfeti_without")
-        PARTITIONERS["round"] = known
+    with (
+        patch.dict(PARTITIONERS, round=PARTITIONERS[round_parts]),
+        contextlib.redirect_stdout(io.StringIO()),
+        counted() as counts,
+    ):
+        try:
+            if name == "ladder":
+                title, cell, value = scene.removeprefix("ladder ").split(", ")
+                (ladder,) = (one for one in LADDERS if one.name == title)
+                run_scene(ladder.rung(cell, float(value)), MPI.COMM_WORLD)
+            else:
+                demos.names_of(name, words)
+        except Exception as error:
+            counts.reasons[type(error).__name__] += 1
+    options.delValue("-tfeti_without")
     return counts
 
 

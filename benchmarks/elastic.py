@@ -20,6 +20,11 @@ def triangles(points: Any, cells: Any) -> dmesh.Mesh:
     return dmesh.create_mesh(MPI.COMM_WORLD, cells=cells.astype(np.int64), x=points, e=element)
 
 
+def gathered(*parts: Any) -> list[Any]:
+    """Arrays, each of them the rows of all ranks. Collective."""
+    return [np.concatenate(MPI.COMM_WORLD.allgather(part)) for part in parts]
+
+
 class Elastic:
     """Elastic bodies with their space.
 

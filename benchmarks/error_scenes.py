@@ -46,6 +46,12 @@ def grading(elements: float, mesh: str, a: float, rate: float = 3.6) -> dict[str
     return {"fine": a / elements, "fine_radius": wide * a, "growth": rate / elements}
 
 
+def against(closed: Any, samples: Callable[[float], Samples] = Samples.line) -> dict[str, Any]:
+    """Where pressures are compared with a closed form, and that there."""
+    places = samples(closed.half_width)
+    return {"samples": places, "exact": closed.pressure(places.distance)}
+
+
 # --- Scenes -------------------------------------------------------------------------------------
 
 R, NU = 1.0, 0.3
@@ -56,7 +62,6 @@ POINT = PointContact.from_half_width(0.05, R, 1 / (1 - NU**2))
 def _line() -> Scene:
     """``hertz_2d.py``."""
     a = LINE.half_width
-    samples = Samples.line(a)
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
         body = Elastic(d, 1.0, NU, "plane_strain", degree)
@@ -67,15 +72,13 @@ def _line() -> Scene:
     return Scene(
         build=lambda n, mesh: half_cylinder.build(R, **grading(n, mesh, a)),
         make=make,
-        samples=samples,
-        exact=LINE.pressure(samples.distance),
+        **against(LINE),
     )
 
 
 def _ball() -> Scene:
     """``hertz_3d.py``."""
     a = POINT.half_width
-    samples = Samples.disc(a)
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
         body = Elastic(d, 1.0, NU, "3d", degree)
@@ -87,8 +90,7 @@ def _ball() -> Scene:
     return Scene(
         build=lambda n, mesh: half_ball.build(R, **grading(n, mesh, a, 1.5)),
         make=make,
-        samples=samples,
-        exact=POINT.pressure(samples.distance),
+        **against(POINT, Samples.disc),
         place=lambda points: points[:, :2],
     )
 
@@ -99,7 +101,6 @@ def _cylinder() -> Scene:
     modulus = 1 / sum((1 - NU**2) / E for E in young.values())
     hertz = LineContact.from_load(force, radius, modulus)
     a = hertz.half_width
-    samples = Samples.line(a)
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
         bodies = Elastic(d, young, NU, "plane_strain", degree)
@@ -113,8 +114,7 @@ def _cylinder() -> Scene:
     return Scene(
         build=lambda n, mesh: cylinder_on_block.build(radius, 4 * radius, **grading(n, mesh, a)),
         make=make,
-        samples=samples,
-        exact=hertz.pressure(samples.distance),
+        **against(hertz),
         young=lambda points: np.where(points[:, 1] > 0.0, young["cylinder"], young["block"]),
     )
 
@@ -148,7 +148,6 @@ def half_planes_pushed(
 
 def _punch() -> Scene:
     """The identical bodies of the demo, their shape in the gap, without friction."""
-    samples = Samples.line(PUNCH.half_width)
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
         P, _, parts = half_planes_pushed(
@@ -160,8 +159,7 @@ def _punch() -> Scene:
     return Scene(
         build=lambda n, mesh: half_planes.build(L, **grading(n, mesh, PUNCH.half_width)),
         make=make,
-        samples=samples,
-        exact=PUNCH.pressure(samples.distance),
+        **against(PUNCH),
     )
 
 
@@ -169,7 +167,6 @@ def _slip() -> Scene:
     """The demo in two steps; what friction leaves, μp − |q|, is Hertz's pressure on |x| < c."""
     loads: list[fem.Constant] = []
     left = LineContact.from_half_width(PAIR.half_width * np.sqrt(1 - PUSH), R, MU / (1 - NU**2) / 2)
-    samples = Samples.line(left.half_width)
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
         friction = tfeti.Coulomb(MU)
@@ -187,8 +184,7 @@ def _slip() -> Scene:
     return Scene(
         build=lambda n, mesh: half_planes.build(L, **grading(n, mesh, PAIR.half_width)),
         make=make,
-        samples=samples,
-        exact=left.pressure(samples.distance),
+        **against(left),
         force=lambda data: MU * data.pressure - np.linalg.norm(data.tangential_traction, axis=1),
         solve=solve,
     )

@@ -35,6 +35,7 @@ from benchmarks.tools import (
     stacked,
 )
 from demos import petsc_options, scene
+from tfeti_dolfinx.common.parallel import largest
 from tfeti_dolfinx.forms.assembly import Forms
 
 # --- The linear problem of a contact's solution on the untorn mesh ------------------------------
@@ -72,8 +73,7 @@ class Linear:
 
     def error(self, x):
         """Largest error of a solution, in terms of the largest displacement. Collective."""
-        own = np.abs(x.array_r - self.reference).max(initial=0.0)
-        return float(self.A.getComm().tompi4py().allreduce(own, op=MPI.MAX) / self.scale)
+        return largest(self.A.getComm().tompi4py(), x.array_r - self.reference) / self.scale
 
 
 def linear_problem(made, solution):
@@ -97,8 +97,8 @@ def linear_problem(made, solution):
     A.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0, x, b)
     b.array[held.ravel()] = 0.0
     x.destroy()
-    scale = comm.allreduce(np.abs(u).max(initial=0.0), op=MPI.MAX)
-    return Linear(A, b, np.where(held, 0.0, u).ravel(), scale, comm.allreduce(seconds, op=MPI.MAX))
+    reference, seconds = np.where(held, 0.0, u).ravel(), comm.allreduce(seconds, op=MPI.MAX)
+    return Linear(A, b, reference, largest(comm, u), seconds)
 
 
 def untorn(K, dofs):
@@ -203,7 +203,7 @@ SCENES = {
 
 
 def contact(made, qp_type, options):
-    """Solve a contact from scratch; the problem and a row."""
+    """Solve a contact from scratch; the solution, the report, and a row."""
     types = {"tfeti_qp_type": qp_type, "tfeti_pc_type": "auto"}
     problem = tfeti.ContactProblem(**made, petsc_options={**options, **types})
     problem.solve()
@@ -217,16 +217,16 @@ def contact(made, qp_type, options):
         "all": solve_seconds(vars(report)),
         "error": report.residuals["displacement_error"],
     }
+    problem.destroy()
     say(row)
-    return problem, row
+    return problem.solution, report, row
 
 
 def study(made, options, arguments):
     """A row for each solver and setting, the fastest of several runs that take turns."""
     rtol, found = float(options.get("tfeti_rtol", 1e-6)), []
-    problem, row = contact(made, "newton", options)
-    linear = linear_problem(made, problem.solution)
-    problem.destroy()
+    solution, _, row = contact(made, "newton", options)
+    linear = linear_problem(made, solution)
     work = [
         (key, first_tolerance(linear, text, rtol))
         for key, text in SETTINGS.items()
@@ -235,15 +235,13 @@ def study(made, options, arguments):
     ]
     for repeat in range(1 if arguments.quick else arguments.repeats):
         if repeat:
-            problem, row = contact(made, "newton", options)
-            problem.destroy()
+            *_, row = contact(made, "newton", options)
         found.append([row, *(linear_row(linear, *given) for given in work)])
     linear.A.destroy()
     linear.b.destroy()
     rows = [min(runs, key=price) for runs in zip(*found, strict=True)]
-    problem, smalse = contact(made, "smalse", options)  # once: it takes its time
-    problem.destroy()
-    return [rows[0], smalse, *rows[1:]], problem.report
+    _, report, smalse = contact(made, "smalse", options)  # once: it takes its time
+    return [rows[0], smalse, *rows[1:]], report
 
 
 def price(row):

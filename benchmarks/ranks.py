@@ -97,27 +97,24 @@ def worker(file, subdomains, clusters):
     """Solve, count, and write what all ranks have found. Collective."""
     counters = ctypes.CDLL(os.environ["LD_PRELOAD"])
     count = (ctypes.c_long * (2 * len(KINDS))).in_dll(counters, "tfeti_sent")
-    sent, runs, pickled = np.ctypeslib.as_array(count), [False], []
+    sent, pickled = np.ctypeslib.as_array(count), []
     solve = tfeti_dolfinx.problem.solve_with_friction
 
-    def watched(*arguments, **keywords):
-        runs[0] = True
-        try:
-            return solve(*arguments, **keywords)
-        finally:
-            runs[0] = False
-
     def dumps(item, *protocol):
-        pickled.extend([1] * runs[0])
+        pickled.append(item)
         return pickle.dumps(item, *protocol)
 
+    def watched(*arguments, **keywords):
+        MPI.pickle.__init__(dumps, pickle.loads)
+        found = solve(*arguments, **keywords)
+        MPI.pickle.__init__(pickle.dumps, pickle.loads)
+        return found
+
     tfeti_dolfinx.problem.solve_with_friction = watched
-    MPI.pickle.__init__(dumps, pickle.loads)
     made = scene("cube_3d", ["--subdomains", subdomains, "--cells", CELLS])
     options = {"tfeti_clusters": clusters} if int(clusters) else {}
     problem = tfeti.ContactProblem(**made, petsc_options=options)
     problem.solve()
-    MPI.pickle.__init__(pickle.dumps, pickle.loads)
     held = arrays(problem)
     problem._system.make({})
     dual = problem.dual

@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -178,28 +179,23 @@ def write_documents(name: str, tables: Tables, commit: str, folder: Path = ROOT 
             path.write_text(made)
 
 
-def started(words: Sequence[object], ranks: int, **environment: str) -> str:
-    """What a program prints, run on so many ranks in processes of its own.
+def json_of(words: Sequence[object], ranks: int) -> Any:
+    """The JSON that a program writes where ``FILE`` stands among its words, run on so many ranks.
 
     Raises:
         RuntimeError: This process is one of several itself, or the program fails.
     """
     if any(int(os.environ.get(variable, 1)) > 1 for variable in MPI_VARIABLES):
         raise RuntimeError("this benchmark starts mpirun itself; run it without")
-    command = ["mpirun", "-n", *map(str, (ranks, *words))]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    if done.returncode != 0:
-        said = "\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:])
-        raise RuntimeError(f"{' '.join(command)} failed:\n{said}")
-    return done.stdout
-
-
-def json_of(words: Sequence[object], ranks: int, **environment: str) -> Any:
-    """The JSON that a program writes where ``FILE`` stands among its words, run as ``started``."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "found.json"
-        started([file if word is FILE else word for word in words], ranks, **environment)
+        words = [file if word is FILE else word for word in words]
+        command = ["mpirun", "-n", *map(str, (ranks, *words))]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        if done.returncode != 0:
+            said = "\n".join((done.stdout + done.stderr).splitlines()[-SHOWN:])
+            raise RuntimeError(f"{' '.join(command)} failed:\n{said}")
         return json.loads(file.read_text())
 
 
@@ -209,15 +205,11 @@ def run_demo(name: str, arguments: Sequence[object], ranks: int) -> dict[str, An
     It also has seconds of the ``processor``: of all ranks, start and mesh included. On a machine
     that others use, too, they say more than those of the wall, but for waiting for each other.
     """
-    before = processor_seconds()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     demo = [sys.executable, ROOT / "demos" / f"{name}.py", *arguments, "--report", FILE]
-    return {**json_of(demo, ranks), "processor": processor_seconds() - before}
-
-
-def processor_seconds() -> float:
-    """Of all processes that this one has started and waited for."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    report, after = json_of(demo, ranks), resource.getrusage(resource.RUSAGE_CHILDREN)
+    seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {**report, "processor": seconds}
 
 
 def best_runs(
@@ -268,7 +260,6 @@ def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iter
 
     Panels of one row that are more than three are drawn in two columns.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     count = rows * panels
@@ -276,7 +267,6 @@ def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iter
         panels, rows = 2, -(-panels // 2)
         height *= rows
     figure = Figure(figsize=(4.6 * panels, height), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = list(figure.subplots(rows, panels, squeeze=False).ravel())
     for unused in axes[count:]:
         unused.remove()
@@ -286,16 +276,13 @@ def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iter
 
 def stacked(axes: Any, title: str, rows: Sequence[Mapping[str, Any]], parts: Sequence[str]) -> None:
     """A bar for each row, labelled with its first column, made of columns that are seconds."""
-    labels = [str(next(iter(row.values()))) for row in rows]
-    left = [0.0] * len(rows)
+    labels, left = [str(next(iter(row.values()))) for row in rows], np.zeros(len(rows))
     for part in parts:
-        widths = [float(row[part]) for row in rows]
-        axes.barh(range(len(rows)), widths, left=left, label=part)
-        left = [a + b for a, b in zip(left, widths, strict=True)]
-    axes.set_yticks(range(len(rows)), labels)
+        widths = np.array([row[part] for row in rows])
+        axes.barh(labels, widths, left=left, label=part)
+        left += widths
     axes.invert_yaxis()
-    axes.set_xlim(0.0, 1.3 * max(left))  # room for the legend
-    axes.set_xlabel("seconds")
+    axes.set(xlim=(0.0, 1.3 * max(left)), xlabel="seconds")  # room for the legend
     axes.set_title(title, fontsize="medium")
     axes.legend(fontsize="small")
 
@@ -321,8 +308,7 @@ def curves(
         plain(axes.yaxis)
     else:
         axes.set_ylim(0.0, 1.4 * max(max(y) for _, y in lines.values()))  # room for the legend
-    axes.set_xlabel(labels[0])
-    axes.set_ylabel(labels[1])
+    axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.set_title(title, fontsize="medium")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", **(BELOW if len(lines) > 4 or names else {}))
@@ -333,12 +319,12 @@ def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
 
     Of a horizontal axis of more than two decades, another one of more than three, 1, 10, 100, ...
     """
-    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+    from matplotlib.ticker import FixedLocator, LogLocator
 
     short = ticks is not None and max(ticks) < 1000 and len(ticks) <= FEW
     low, high = axis.get_data_interval()
     wide = high > (1e2 if axis.axis_name == "x" else 1e3) * low
     few = LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0))
     axis.set_major_locator(FixedLocator(ticks) if short else few)
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.minorticks_off()
+    axis.set_major_formatter("{x:g}")

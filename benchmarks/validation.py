@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from math import log, pi, sqrt
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-from benchmarks.elastic import Elastic
+from benchmarks.elastic import Elastic, gathered
 from benchmarks.pressures import LineContact, PointContact, fit
 from benchmarks.tools import Tables, command_line, finish, say
 from demos import run
@@ -29,6 +28,7 @@ from demos import scene as scene_of
 from meshes import blocks, cylinder_on_block
 from meshes.rings import lame_pressure, rings
 from meshes.tools import graded_size, started_model, torn
+from tfeti_dolfinx.common.parallel import largest
 
 COMM = MPI.COMM_WORLD
 # sizes of elements, over those of the quick run
@@ -43,13 +43,13 @@ def figure(
     reference: float,
     got: float,
     allowed: float | None,
-    problem: Any,
+    report: tfeti.Report,
     multiplications: int | None = None,
 ) -> Row:
     """A row: a published figure, or that of a closed form, and ours.
 
     Relative differences, but of an error, whose reference is 0, itself; ``allowed`` by the source,
-    None where a figure is for information. Multiplications are those of the last solve by default.
+    None where a figure is for information. Multiplications are those of all solves by default.
     """
     difference = (got - reference) / (abs(reference) or 1.0)
     return {
@@ -59,14 +59,14 @@ def figure(
         "got": f"{got:.5g}",
         "difference": f"{100 * difference:+.2f} %",
         "allowed": None if allowed is None else f"{100 * allowed:g} %",
-        "unknowns": problem.report.primal_dofs,
-        "F + S": work(problem) if multiplications is None else multiplications,
+        "unknowns": report.primal_dofs,
+        "F + S": multiplications or work(report),
     }
 
 
-def work(problem: tfeti.ContactProblem) -> int:
-    """Multiplications of the last solve."""
-    return sum(getattr(problem.report, name) for name in COUNTS)
+def work(report: tfeti.Report) -> int:
+    """Multiplications of all solves of a problem."""
+    return sum(int(report.in_all[name]) for name in COUNTS)
 
 
 # --- Meshes and forms -------------------------------------------------------------------------
@@ -167,11 +167,11 @@ def point_contact(
     found = fit(COMM, data.points[:, 0], data.pressure, hertz.peak)
     own, names = (hertz.half_width, hertz.peak), ("a", "p₀")
     rows = [
-        figure(case, f"{name} of the force, Hertz", expected, got, 0.01, problem)
+        figure(case, f"{name} of the force, Hertz", expected, got, 0.01, problem.report)
         for name, expected, got in zip(names, own, found, strict=True)
     ]
     for name, expected, got in zip(names, published, found, strict=False):
-        rows.append(figure(case, f"{name}, published", expected, got, published[2], problem))
+        rows.append(figure(case, f"{name}, published", expected, got, published[2], problem.report))
     return rows, problem
 
 
@@ -203,8 +203,8 @@ def steel_on_aluminium(scale: float) -> Iterator[Row]:
     data = problem.solution.contact()
     a, p0 = fit(COMM, data.points[:, 0], data.pressure, hertz.peak)
     case = "NAFEMS B1 (SSNP154), cylinder on block"
-    yield figure(case, "p₀", 3585.4, p0, 0.01, problem)
-    yield figure(case, "a", 6.21, a, 0.01, problem)
+    yield figure(case, "p₀", 3585.4, p0, 0.01, problem.report)
+    yield figure(case, "a", 6.21, a, 0.01, problem.report)
 
 
 def sliding_wedge(scale: float) -> Iterator[Row]:
@@ -230,9 +230,11 @@ def sliding_wedge(scale: float) -> Iterator[Row]:
                 high = force
             else:
                 low = force
-            total += work(problem)
+            total += work(problem.report)
         case = "NAFEMS CGS-4, sliding wedge"
-        yield figure(case, f"F/G, μ = {mu:g}", published, low / weight, 0.002, problem, total)
+        yield figure(
+            case, f"F/G, μ = {mu:g}", published, low / weight, 0.002, problem.report, total
+        )
 
 
 def concentric_rings(scale: float) -> Iterator[Row]:
@@ -249,9 +251,9 @@ def concentric_rings(scale: float) -> Iterator[Row]:
     powers = np.array([data.pressure, (data.pressure - published) ** 2, np.ones_like(data.area)])
     total, squares, area = COMM.allreduce(powers @ data.area)
     case = "SSNP152, concentric rings"
-    yield figure(case, "mean pressure", published, total / area, 0.007, problem)
+    yield figure(case, "mean pressure", published, total / area, 0.007, problem.report)
     error = sqrt(squares / area) / published
-    yield figure(case, "relative L² error of the pressure", 0.0, error, 0.007, problem)
+    yield figure(case, "relative L² error of the pressure", 0.0, error, 0.007, problem.report)
 
 
 def patches(scale: float) -> Iterator[Row]:
@@ -271,10 +273,9 @@ def patches(scale: float) -> Iterator[Row]:
         problem = scene.problem([tfeti.Contact("upper bottom", "lower top")], rtol=1e-10)
         problem.solve()
         data = problem.solution.contact()
-        worst = np.max(np.abs(data.pressure - pressure), initial=0.0)
-        worst = COMM.allreduce(worst, op=MPI.MAX)
+        worst = largest(COMM, data.pressure - pressure)
         case = f"{'SSNP121' if gdim == 2 else 'SSNV167'}, patch test"
-        yield figure(case, "pressure, worst node", pressure, pressure + worst, 1e-6, problem)
+        yield figure(case, "pressure, worst node", pressure, pressure + worst, 1e-6, problem.report)
 
 
 def rigid_sphere(scale: float) -> Iterator[Row]:
@@ -285,7 +286,7 @@ def rigid_sphere(scale: float) -> Iterator[Row]:
     rows, problem = point_contact(case, mesh, ball, (rigid, R / 2), (0.1, 9.55e5, None))
     yield from rows
     force = abs(problem.solution.contact().resultant.force[1])
-    yield figure(case, "F, published", 2.0e4, force, None, problem)
+    yield figure(case, "F, published", 2.0e4, force, None, problem.report)
 
 
 def press_fit(scale: float) -> Iterator[Row]:
@@ -298,7 +299,7 @@ def press_fit(scale: float) -> Iterator[Row]:
     data = problem.solution.contact()
     total, area = COMM.allreduce(np.array([data.area @ data.pressure, data.area.sum()]))
     lame, case = lame_pressure(overlap), "press fit (Lamé)"
-    yield figure(case, "mean pressure", lame, total / area, 0.01, problem)
+    yield figure(case, "mean pressure", lame, total / area, 0.01, problem.report)
 
 
 def loaded_pin(scale: float) -> Iterator[Row]:
@@ -322,8 +323,7 @@ def loaded_pin(scale: float) -> Iterator[Row]:
         data = problem.solution.contact()
         own = np.degrees(np.arctan2(data.points[:, 1], data.points[:, 0]))
         slip = np.linalg.norm(data.tangential_traction.reshape(len(own), -1), axis=1)
-        parts = COMM.allgather((own, data.pressure, slip))
-        angle, pressure, slip = (np.concatenate(part) for part in zip(*parts, strict=True))
+        angle, pressure, slip = gathered(own, data.pressure, slip)
         order = np.argsort(angle)
         angle, pressure, slip = angle[order], pressure[order], slip[order]
         figures = {f"pressure at {at}°": np.interp(at, angle, pressure) for at in (0, 30, 60)}
@@ -337,7 +337,7 @@ def loaded_pin(scale: float) -> Iterator[Row]:
         case = "NAFEMS B4 (SSNP156), loaded pin"
         allowed = None if name == "pressure at 0°" else 0.01
         finer = found[0][name]
-        yield figure(case, f"{name}, finer mesh", finer, got, allowed, problem)
+        yield figure(case, f"{name}, finer mesh", finer, got, allowed, problem.report)
 
 
 def bar_on_wall(scale: float) -> Iterator[Row]:
@@ -352,10 +352,8 @@ def bar_on_wall(scale: float) -> Iterator[Row]:
         "stress": (4e9, 4e9 * (1 + found["pressure"])),
         "velocity afterwards": (100.0, 100.0 * (1 + found["velocity"])),
     }
-    case, of_run = "SDNV100, bar on a rigid wall", SimpleNamespace(report=report)
-    total = sum(report.in_all[name] for name in COUNTS)
     for quantity, values in figures.items():
-        yield figure(case, quantity, *values, 0.05, of_run, total)
+        yield figure("SDNV100, bar on a rigid wall", quantity, *values, 0.05, report)
 
 
 def plastic_indentation(scale: float) -> Iterator[Row]:
@@ -370,19 +368,17 @@ def plastic_indentation(scale: float) -> Iterator[Row]:
     words = ["--size", scale * 20.0, "--near", 360.0]
     made = scene_of("plastic_indentation_2d", words, "NonlinearContactProblem")
     problem = tfeti.NonlinearContactProblem(**made)
-    total, case = 0, "SSNV506, plastic indentation"
-    step = 5.0 * scale
+    case, step = "SSNV506, plastic indentation", 5.0 * scale
     for depth in np.arange(step, max(figures) + 0.5 * step, step):
         problem.time = depth
         problem.solve()
         problem.accept()
-        total += work(problem)
         if depth in figures:
             slip, other, allowed = figures[depth]
             force = abs(problem.solution.contact().resultant.force[1]) / (2 * pi)
             at = f"force at {depth:.0f}"
-            yield figure(case, f"{at}, slip lines", slip, force, allowed, problem, total)
-            yield figure(case, f"{at}, Code_Aster", other, force, None, problem, total)
+            yield figure(case, f"{at}, slip lines", slip, force, allowed, problem.report)
+            yield figure(case, f"{at}, Code_Aster", other, force, None, problem.report)
 
 
 def thick_cylinder(scale: float) -> Iterator[Row]:
@@ -395,20 +391,19 @@ def thick_cylinder(scale: float) -> Iterator[Row]:
     for side in ("bottom", "top"):
         scene.hold(side, 1)
     steel, problem = scene.plastic([], 1e-8, yield_stress=strength)
-    inner, total = scene.dofs("left", 0), 0
+    inner = scene.dofs("left", 0)
     residual = fem.form(steel.residual(scene.v))
     for value in np.linspace(0.001, 0.02, 20):
         out.value = value
         problem.solve()
         problem.accept()
-        total += work(problem)
     reaction = fem.assemble_vector(residual).array[inner]
     owned = inner < scene.V.dofmap.index_map.size_local * scene.V.dofmap.index_map_bs
     force = COMM.allreduce(float(np.sum(reaction[owned])))
     pressure = force / (2 * pi * Ri * 0.1)
     limit = 2 / sqrt(3) * strength * log(Ro / Ri)
     case = "thick cylinder to collapse"
-    yield figure(case, "limit pressure", limit, pressure, 0.01, problem, total)
+    yield figure(case, "limit pressure", limit, pressure, 0.01, problem.report)
 
 
 def taylor_bar(scale: float) -> Iterator[Row]:
@@ -447,11 +442,9 @@ def taylor_bar(scale: float) -> Iterator[Row]:
         values = u.x.array.reshape(-1, 2)
         foot = COMM.allreduce(float(values[:, 0].max(initial=0.0)), op=MPI.MAX)
         head = COMM.allreduce(float(values[:, 1].min(initial=0.0)), op=MPI.MIN)
-        case, counted = "SDNV103, Taylor bar", problem.report.in_all
-        total = sum(counted[name] for name in COUNTS)
-        yield figure(case, f"growth of the foot, {whose}", wider, foot, allowed, problem, total)
-        way = f"way of the head, {whose}"
-        yield figure(case, way, shorter, flight - head, allowed, problem, total)
+        case, report = "SDNV103, Taylor bar", problem.report
+        yield figure(case, f"growth of the foot, {whose}", wider, foot, allowed, report)
+        yield figure(case, f"way of the head, {whose}", shorter, flight - head, allowed, report)
 
 
 CASES: dict[str, Callable[[float], Iterator[Row]]] = {

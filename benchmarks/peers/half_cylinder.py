@@ -19,35 +19,25 @@ PEERS = {"GetFEM": (1, 2), "CalculiX": (1, 2), "Kratos": (1,)}  # orders of mesh
 def mesh(size, order, file):
     """Mesh the scene and write it; in ./run."""
     import gmsh
+    import meshio
     import numpy as np
 
     from benchmarks.error_scenes import GRADED, LINE, NU, SCENES, R
     from meshes.tools import element_options
 
-    def group(dim, name):
-        """Nodes of the elements of a physical group."""
-        groups = gmsh.model.getPhysicalGroups(dim)
-        (tag,) = (tag for _, tag in groups if gmsh.model.getPhysicalName(dim, tag) == name)
-        found = []
-        for entity in gmsh.model.getEntitiesForPhysicalGroup(dim, tag):
-            (kind,), _, (nodes,) = gmsh.model.mesh.getElements(dim, entity)
-            nodes_each = gmsh.model.mesh.getElementProperties(kind)[3]
-            found.append(nodes.reshape(-1, nodes_each).astype(np.int64))
-        return np.concatenate(found)
-
     with element_options(ElementOrder=order):
         SCENES["half cylinder"]().build(size, GRADED)
-    tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    cells = group(2, "body")
-    used = np.unique(cells)
-    number, place = np.zeros((2, int(tags.max()) + 1), dtype=np.int64)
-    number[used], place[tags.astype(np.int64)] = np.arange(len(used)), np.arange(len(tags))
-    cells, points = number[cells], coordinates.reshape(-1, 3)[place[used], :2]
-    found = {"points": points, "cells": cells, "order": order, "axis": number[group(1, "axis")]}
+    gmsh.write(str(made := file.with_suffix(".msh")))
+    read = meshio.read(made)
+    triangle, line = {1: ("triangle", "line"), 2: ("triangle6", "line3")}[order]
+    cells, lines, points = read.cells_dict[triangle], read.cells_dict[line], read.points[:, :2]
+    tags = read.get_cell_data("gmsh:physical", line)
+    group = {name: lines[tags == tag] for name, (tag, dim) in read.field_data.items() if dim == 1}
+    found = {"points": points, "cells": cells, "order": order, "axis": group["axis"]}
     # ends of the edge opposite of a corner, as it lies in its cell, and the node between them
     along = np.array([(1, 2, 4), (2, 0, 5), (0, 1, 3)])[:, : order + 1]
     for surface in ("contact", "top"):
-        on = np.isin(cells[:, :3], number[group(1, surface)])
+        on = np.isin(cells[:, :3], group[surface])
         found[f"{surface} cells"] = facets = facets_on(on)
         found[surface] = np.take_along_axis(cells[facets[:, 0]], along[facets[:, 1]], axis=1)
     ends = points[found["top"][:, :2]]

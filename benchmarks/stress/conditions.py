@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import basix
 import numpy as np
-from scipy.sparse import csr_array, diags_array, eye_array, vstack
+from scipy.sparse import csr_array, diags_array, eye_array, kron, vstack
 
 from benchmarks.stress.scene import Scene, Side, wall_distance
 
@@ -32,10 +32,11 @@ class Conditions:
     """All conditions of a scene."""
 
     N: csr_array  # shape ``(c, n)``
-    T: csr_array  # along tangents, gdim − 1 rows of each condition, one after the other
+    T: csr_array  # slips T u + slip, gdim − 1 rows of each condition, one after the other
     gap: np.ndarray  # shape ``(c,)``
     given: np.ndarray  # largest tangential forces, by Tresca's law
     coefficient: np.ndarray  # of Coulomb's law
+    slip: np.ndarray | None = None  # of prescribed values, where u are the free unknowns alone
 
     @property
     def has_friction(self) -> bool:
@@ -62,12 +63,12 @@ def conditions(scene: Scene, x: np.ndarray, facets_of: FacetsOf, fixed: np.ndarr
     # the normal, and tangents that are orthonormal to it
     frames = np.linalg.svd(np.concatenate(normals)[:, None])[2]
     frames[:, 0] = np.concatenate(normals)
-    bounds = np.zeros((2, W.shape[0]))
-    for kind, bound in zip(("tresca", "coulomb"), bounds, strict=True):
-        values = [law[1] if law and law[0] == kind else 0.0 for law in laws]
-        bound[:] = np.repeat(values, [len(gap) for gap in gaps])
+    given, coefficient = (
+        np.repeat([law[1] if law and law[0] == kind else 0.0 for law in laws], list(map(len, gaps)))
+        for kind in ("tresca", "coulomb")
+    )
     N, T = _rows(W, frames[:, :1]), _rows(W, frames[:, 1:])
-    return Conditions(N, T, np.concatenate(gaps), bounds[0] * np.concatenate(areas), bounds[1])
+    return Conditions(N, T, np.concatenate(gaps), given * np.concatenate(areas), coefficient)
 
 
 def _at_walls(
@@ -116,12 +117,9 @@ def _of_pairs(
 
 def _rows(W: csr_array, axes: np.ndarray) -> csr_array:
     """Rows Σ_j w_ij a·u_j along the axes a of each condition, shape ``(c, k, gdim)``."""
-    (_, count, gdim), (row, node) = axes.shape, (W := W.tocoo()).coords
-    values = W.data[:, None, None] * axes[row]
-    rows = row[:, None, None] * count + np.arange(count)[:, None]
-    columns = node[:, None, None] * gdim + np.arange(gdim)
-    places = [np.broadcast_to(part, values.shape).ravel() for part in (rows, columns)]
-    found = csr_array((values.ravel(), tuple(places)), shape=(len(axes) * count, W.shape[1] * gdim))
+    weights = kron(W, np.ones(axes.shape[1:]), format="csr")
+    along = np.tile(axes.reshape(-1, axes.shape[2]), W.shape[1])
+    found = csr_array(weights.multiply(along))
     found.eliminate_zeros()
     return found
 

@@ -55,38 +55,37 @@ def grid(scene: Scene) -> Grid:
     return g
 
 
-def make_mesh(scene: Scene, g: Grid, comm: MPI.Intracomm) -> dmesh.Mesh:
-    """The mesh, from the cells that rank 0 has."""
+def make_mesh(
+    scene: Scene, g: Grid, comm: MPI.Intracomm
+) -> tuple[dmesh.Mesh, dmesh.MeshTags, np.ndarray]:
+    """The mesh, from the cells that rank 0 has, tags of all sides, cells of the grid here."""
     own = slice(None) if comm.rank == 0 else slice(0, 0)
     element = basix.ufl.element("Lagrange", scene.cell, 1, shape=(scene.gdim,))
-    return dmesh.create_mesh(comm, cells=g.cells[own], x=g.points[own], e=element)
-
-
-def tag_sides(scene: Scene, mesh: dmesh.Mesh, body_of_cell: np.ndarray) -> dmesh.MeshTags:
-    """Sides of all bodies; ``body_of_cell`` is that of the cells of this rank."""
-    tdim = mesh.topology.dim
+    mesh = dmesh.create_mesh(comm, cells=g.cells[own], x=g.points[own], e=element)
+    cell, tdim = np.asarray(mesh.topology.original_cell_index), scene.gdim
     mesh.topology.create_connectivity(tdim - 1, tdim)
     facets = dmesh.exterior_facet_indices(mesh.topology)
     links = mesh.topology.connectivity(tdim - 1, tdim)
-    first = np.array([links.links(f)[0] for f in facets], dtype=int)
-    body = body_of_cell[first]
+    body = g.body[cell[np.array([links.links(f)[0] for f in facets], dtype=int)]]
     middle = dmesh.compute_midpoints(mesh, tdim - 1, facets)[:, :tdim]
-    low = np.array([b.low for b in scene.bodies])[body].reshape(-1, tdim)
-    high = np.array([b.high for b in scene.bodies])[body].reshape(-1, tdim)
+    low, high = np.array([(b.low, b.high) for b in scene.bodies])[body].swapaxes(0, 1)
     # a facet's midpoint is on its own side, and half a cell away from all others
     away = np.stack((middle - low, high - middle), axis=2) / (high - low)[:, :, None]
-    side = np.abs(away).reshape(len(facets), -1).argmin(axis=1) if len(facets) else body
+    side = np.abs(away).reshape(-1, 2 * tdim).argmin(axis=1)
     tags = (body * 2 * tdim + side + 1).astype(np.int32)
-    return dmesh.meshtags(mesh, tdim - 1, facets, tags)
+    if scene.bent is not None:
+        kind, strength = scene.bent
+        {"layers": _layers, "slivers": _slivers, "arch": _arch}[kind](scene, mesh, strength)
+    return mesh, dmesh.meshtags(mesh, tdim - 1, facets, tags), cell
 
 
-def loads_of(scene: Scene) -> np.ndarray:
-    """Tractions on the sides of each body and its force per volume: (bodies, sides + 1, gdim)."""
+def loads_of(scene: Scene, g: Grid) -> np.ndarray:
+    """Tractions on the sides of each cell's body and its force per volume, one after the other."""
     values = np.zeros((len(scene.bodies), 2 * scene.gdim + 1, scene.gdim))
     for load in scene.loads:
         body, axis, end = load.side
         values[body, 2 * axis + end if axis >= 0 else -1] += load.value
-    return values
+    return values[g.body]
 
 
 def materials(scene: Scene, g: Grid, subdomain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,23 +106,18 @@ def cellwise(mesh: dmesh.Mesh, values: np.ndarray) -> fem.Function:
 
 
 def elasticity(
-    scene: Scene,
-    mesh: dmesh.Mesh,
-    facet_tags: dmesh.MeshTags,
-    mu: np.ndarray,
-    lmbda: np.ndarray,
-    loads: np.ndarray,
+    scene: Scene, mesh: dmesh.Mesh, facet_tags: dmesh.MeshTags, *of_cells: np.ndarray
 ) -> tuple[Any, Any, Any]:
-    """V, a, L; the coefficients are those of this rank's cells.
+    """V, a, L; Lamé's μ and λ and ``loads_of`` are those of this rank's cells.
 
     One compiled form serves all scenes of a cell type: tractions depend on the facet's normal.
     """
     gdim = scene.gdim
     V = fem.functionspace(mesh, ("Lagrange", scene.order, (gdim,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    mu, lmbda, t = (cellwise(mesh, values) for values in (mu, lmbda, loads))
-    flat = len(SPLIT.get(scene.cell, [])) > 0
-    quadrature = {"quadrature_degree": (1 if flat else 2) if scene.order == 1 else 4}
+    mu, lmbda, t = (cellwise(mesh, values) for values in of_cells)
+    linear = 1 if scene.cell in SPLIT else 2
+    quadrature = {"quadrature_degree": linear if scene.order == 1 else 4}
     dx = ufl.Measure("dx", domain=mesh, metadata=quadrature)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=facet_tags, metadata=quadrature)
     e, n = ufl.sym(ufl.grad(u)), ufl.FacetNormal(mesh)
@@ -177,10 +171,3 @@ def _arch(scene: Scene, mesh: dmesh.Mesh, strength: float) -> None:
     height = x[:, up].copy()
     x[:, 0] = middle + (strength - height) * np.sin(angle)
     x[:, up] = strength - (strength - height) * np.cos(angle)
-
-
-def bend(scene: Scene, mesh: dmesh.Mesh) -> None:
-    """Move the points of a mesh of boxes as a scene says; the first body is what is moved."""
-    if scene.bent is not None:
-        kind, strength = scene.bent
-        {"layers": _layers, "slivers": _slivers, "arch": _arch}[kind](scene, mesh, strength)

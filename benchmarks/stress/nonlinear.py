@@ -117,9 +117,7 @@ def blocks(scene: Scene) -> tuple[dmesh.Mesh, Any, dict[str, int]]:
         Body((*up, float(k)), (*(1.0 for _ in up), k + 1.0), n) for k, n in enumerate(scene.cells)
     ]
     boxes = Boxes(scene.cell, tuple(bodies))
-    g = meshes.grid(boxes)
-    mesh = meshes.make_mesh(boxes, g, MPI.COMM_SELF)
-    tags = meshes.tag_sides(boxes, mesh, g.body[np.asarray(mesh.topology.original_cell_index)])
+    mesh, tags, _ = meshes.make_mesh(boxes, meshes.grid(boxes), MPI.COMM_SELF)
     last, axis = len(bodies) - 1, len(up)
     names = {"bottom": (0, axis, 0), "top": (last, axis, 1)}
     if last:

@@ -104,18 +104,14 @@ def solve_scene(scene: Scene, g: meshes.Grid, comm: MPI.Intracomm) -> Outcome:
 def _problem(
     scene: Scene, g: meshes.Grid, comm: MPI.Intracomm, outcome: Outcome
 ) -> tfeti.ContactProblem:
-    mesh = meshes.make_mesh(scene, g, comm)
-    original = np.asarray(mesh.topology.original_cell_index)
-    tags = meshes.tag_sides(scene, mesh, g.body[original])
-    meshes.bend(scene, mesh)
+    mesh, tags, _ = meshes.make_mesh(scene, g, comm)
     d = tfeti.decompose(mesh, partition(scene), facet_tags=tags, surfaces=scene.surfaces)
     subdomain = np.zeros(len(g.cells), dtype=np.int64)
     subdomain[d.original_cells] = d.cell_subdomain
     subdomain = comm.allreduce(subdomain)
     outcome.mu, outcome.lmbda = mu, lmbda = meshes.materials(scene, g, subdomain)
-    cell = d.original_cells
-    loads = meshes.loads_of(scene)[g.body[cell]]
-    V, a, L = meshes.elasticity(scene, d.mesh, d.facet_tags, mu[cell], lmbda[cell], loads)
+    of_cells = (values[d.original_cells] for values in (mu, lmbda, meshes.loads_of(scene, g)))
+    V, a, L = meshes.elasticity(scene, d.mesh, d.facet_tags, *of_cells)
     bcs = meshes.prescribed(scene, V, lambda side: d.facets(side_name(side)))
     options = dict(scene.options)
     return tfeti.ContactProblem(a, L, bcs, contacts_of(scene), d, petsc_options=options)

@@ -64,8 +64,8 @@ class Draw:
         nu = self.one(0.0, 0.49, 0.499, 0.4999) if self.spice(0.2) else self.real(0.1, 0.4)
         E = 10 ** self.real(-8, 0) if self.jumps else 1.0
         jump = 10 ** self.real(1, 8) if self.spice(0.15) else 1.0
-        corners = floats(low), floats(low + size)
-        self.bodies.append(Body(*corners, tuple(int(v) for v in n), E, nu, jump))
+        low, high = tuple(low.tolist()), tuple((low + size).tolist())
+        self.bodies.append(Body(low, high, tuple(n.tolist()), E, nu, jump))
         return len(self.bodies) - 1
 
     def size(self) -> np.ndarray:
@@ -92,7 +92,7 @@ class Draw:
             return
         if components is None:
             chosen = np.flatnonzero(self.rng.uniform(size=self.gdim) < 0.6)
-            components = tuple(int(c) for c in chosen) or (side[1],)
+            components = tuple(chosen.tolist()) or (side[1],)
         value = self.real(-0.01, 0.01) if self.chance(0.08) else 0.0
         others = [h.value for h in self.held if h.side[0] == side[0]]
         value = others[0] if others else value  # values of sides that meet must agree
@@ -125,7 +125,7 @@ class Draw:
         else:
             depth = np.sqrt(R**2 - 0.25 * np.sum(extent**2))
             data = centre - depth * out, np.array([R + gap])
-        self.walls.append(Wall(side, kind, tuple(floats(v) for v in data)))
+        self.walls.append(Wall(side, kind, tuple(tuple(v.tolist()) for v in data)))
 
     def meet(self, a: Side, b: Side) -> None:
         """A pair, either side secondary."""
@@ -138,8 +138,8 @@ class Draw:
             direction = self.rng.normal(size=self.gdim)
             if self.chance(0.3):
                 direction *= self.rng.uniform(size=self.gdim) < 0.5
-        value = floats(10 ** self.real(-1, 0) * direction)
-        self.loads.append(Load(side or (body, -1, 0), value))
+        value = 10 ** self.real(-1, 0) * direction
+        self.loads.append(Load(side or (body, -1, 0), tuple(value.tolist())))
 
     def down(self) -> np.ndarray:
         """Down, sometimes aslant."""
@@ -172,11 +172,6 @@ class Draw:
             note=self.note,
         )
         return whole.in_units(length, modulus, strain)
-
-
-def floats(values: Any) -> tuple[float, ...]:
-    """Plain numbers."""
-    return tuple(float(v) for v in values)
 
 
 def random_scene(seed: int) -> Scene:

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from dolfinx import fem
-from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scipy.sparse import csr_array, diags_array
 
 from benchmarks.stress import meshes
-from benchmarks.stress.conditions import conditions
-from benchmarks.stress.scene import Scene, Side
-from benchmarks.stress.sliding import Law, solve_sliding
+from benchmarks.stress.conditions import Conditions, conditions
+from benchmarks.stress.scene import Scene, Side, side_name
+from benchmarks.stress.sliding import solve_sliding
 from benchmarks.stress.solve import DEPENDENT, EPSILON, UnsettledError, null_space, solve, verdict
-from tfeti_dolfinx.common.compat import geometry_dofmap
 
 SMALLEST = 2.5e-9  # of the largest displacement: a body has no less, 2.5e-13 of all being rounding
 NO_WORK = 1e-13  # of all loads: rounding
@@ -69,12 +68,9 @@ class Untorn:
 
     def __init__(self, scene: Scene, g: meshes.Grid, mu: np.ndarray, lmbda: np.ndarray) -> None:
         self.scene, self.gdim = scene, scene.gdim
-        mesh = meshes.make_mesh(scene, g, MPI.COMM_SELF)
-        cell = np.asarray(mesh.topology.original_cell_index)
-        tags = meshes.tag_sides(scene, mesh, g.body[cell])
-        meshes.bend(scene, mesh)
-        loads = meshes.loads_of(scene)[g.body[cell]]
-        V, a, L = meshes.elasticity(scene, mesh, tags, mu[cell], lmbda[cell], loads)
+        mesh, tags, cell = meshes.make_mesh(scene, g, MPI.COMM_SELF)
+        of_cells = (values[cell] for values in (mu, lmbda, meshes.loads_of(scene, g)))
+        V, a, L = meshes.elasticity(scene, mesh, tags, *of_cells)
         K = fem.assemble_matrix(fem.form(a), block_mode=None).to_scipy()
         self.K, self.f = csr_array(K), fem.assemble_vector(fem.form(L)).array.copy()
         self.x = V.tabulate_dof_coordinates()
@@ -82,9 +78,6 @@ class Untorn:
         cells = V.dofmap.list
         self.body[cells] = g.body[cell][:, None]
         self._mesh, self._tags, self._V = mesh, tags, V
-        self._dof = np.zeros(len(mesh.geometry.x), dtype=int)
-        corners = geometry_dofmap(mesh)
-        self._dof[corners] = cells[:, : corners.shape[1]]
         self._nodes_of = [np.unique(cells[g.body[cell] == b]) for b in range(len(scene.bodies))]
         self.fixed, self.values = np.zeros(len(self.f), dtype=bool), np.zeros(len(self.f))
         for bc in meshes.prescribed(scene, V, self._facets):
@@ -97,25 +90,21 @@ class Untorn:
         self.length = float(min(box.max() for box in boxes))
 
     def _facets(self, side: Side) -> np.ndarray:
-        body, axis, end = side
-        return self._tags.find(body * 2 * self.gdim + 2 * axis + end + 1)
+        return self._tags.find(self.scene.surfaces[side_name(side)])
 
     def _facet_nodes(self, side: Side) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and all nodes of the facets of a side."""
-        mesh, fdim, facets = self._mesh, self.gdim - 1, self._facets(side)
-        vertices = self._dof[dmesh.entities_to_geometry(mesh, fdim, facets)]
-        if self.scene.order == 1:
-            return vertices, vertices
-        mesh.topology.create_connectivity(fdim, fdim + 1)
-        mesh.topology.create_connectivity(fdim + 1, fdim)
-        own, every = mesh.topology.connectivity(fdim, fdim + 1), []
-        of_cells = mesh.topology.connectivity(fdim + 1, fdim)
-        layout = self._V.dofmap.dof_layout
-        for facet in facets:
-            cell = own.links(facet)[0]
-            local = int(np.flatnonzero(of_cells.links(cell) == facet)[0])
-            every.append(self._V.dofmap.list[cell][layout.entity_closure_dofs(fdim, local)])
-        return vertices, np.array(every)
+        topology, fdim, nodes = self._mesh.topology, self.gdim - 1, []
+        topology.create_connectivity(fdim + 1, fdim)
+        cell_of = topology.connectivity(fdim, fdim + 1)
+        facets_of = topology.connectivity(fdim + 1, fdim)
+        for facet in self._facets(side):
+            cell = cell_of.links(facet)[0]
+            local = int(np.flatnonzero(facets_of.links(cell) == facet)[0])
+            on_facet = self._V.dofmap.dof_layout.entity_closure_dofs(fdim, local)
+            nodes.append(self._V.dofmap.list[cell][on_facet])  # vertices first
+        corners = fdim + 1 if self.scene.cell in meshes.SPLIT else 2**fdim
+        return np.array(nodes)[:, :corners], np.array(nodes)
 
     def rigid_motions(self) -> np.ndarray:
         """Motions of bodies that prescribed values and hinges leave, largest about 1."""
@@ -138,10 +127,9 @@ class Untorn:
             held.append(np.repeat(np.isin(np.arange(len(self.x)), nodes), gdim))
         return _hinged(out, held)
 
-    def _slid(self, known: Answer, free: np.ndarray) -> None:
-        """The answer where there is friction."""
-        c = self.conditions
-        f = self.f - self.K @ self.values
+    def _slid(self, known: Answer, K: csr_array, f: np.ndarray, gap: np.ndarray) -> None:
+        """The answer where there is friction: K, loads and gaps of the free unknowns are given."""
+        c, free = self.conditions, ~self.fixed
         size = (np.asarray(abs(A).sum(axis=1)) for A in (c.T[:, free], c.T))
         # on a plane of symmetry nothing slips across, whatever other nodes leave of a row
         slips = np.divide(*size) > LITTLE
@@ -152,16 +140,9 @@ class Untorn:
         moves = np.asarray(abs(c.N[:, free]).sum(axis=1)).ravel() > DEPENDENT
         moves |= (c.given > 0.0) & (size > DEPENDENT)
         along = np.repeat(moves, T.shape[0] // len(moves))
-        K, gap = self.K[free][:, free], c.gap[moves] - c.N[moves] @ self.values
-        law = Law(
-            c.N[moves][:, free],
-            T[along],
-            gap,
-            slip[along] @ self.values,
-            c.given[moves],
-            c.coefficient[moves],
-        )
-        u, lam, tau = solve_sliding(K, f[free], law)
+        N, gap, slipped = c.N[moves][:, free], gap[moves], slip[along] @ self.values
+        law = Conditions(N, T[along], gap, c.given[moves], c.coefficient[moves], slipped)
+        u, lam, tau = solve_sliding(K, f, law)
         known.free = np.zeros((len(self.f), 0))
         known.u = self._smallest(u, known.free)
         force = c.N[moves].T @ lam + slip[along].T @ tau.ravel()
@@ -169,7 +150,7 @@ class Untorn:
         known.noise = np.zeros(len(self.scene.bodies))
         K, gap = self._shaken(known, K, c.N[moves], gap)
         with contextlib.suppress(UnsettledError):
-            u, *_ = solve_sliding(K, f[free], replace(law, gap=gap))
+            u, *_ = solve_sliding(K, f, replace(law, gap=gap))
             known.noise = body_errors(known, self._smallest(u, known.free))
 
     def _shaken(
@@ -189,20 +170,18 @@ class Untorn:
         """Verdict and solution."""
         known = Answer("", self.x, self.body, self.rows, self.gap, np.abs(self.f).sum())
         free = ~self.fixed
-        f = self.f[free] - self.K[free][:, self.fixed] @ self.values[self.fixed]
-        N = self.rows[:, free]
-        gap = self.gap - self.rows[:, self.fixed] @ self.values[self.fixed]
+        K, f = self.K[free][:, free], (self.f - self.K @ self.values)[free]
+        N, gap = self.rows[:, free], self.gap - self.rows @ self.values
         R = self.rigid_motions()[free]
         weight = np.sqrt(N.multiply(N).sum(axis=1)) if N.shape[0] else np.zeros(0)
         known.verdict = verdict(N, gap, R, self.f[free], weight, self.length)
         if self.conditions.has_friction:
             known.verdict = "solvable"
-            self._slid(known, free)
+            self._slid(known, K, f, gap)
         if known.verdict != "solvable" or known.u is not None:
             return known
         used = (weight > DEPENDENT) & _first(self.rows, self.gap)
         N, gap = N[used], gap[used]
-        K = self.K[free][:, free]
         e = R.T @ self.f[free]
         e[np.abs(e) <= NO_WORK * known.load] = 0.0
         lam, u, rigid = solve(K, f, N, gap, R, e)
@@ -243,19 +222,13 @@ def _first(N: csr_array, gap: np.ndarray) -> np.ndarray:
 
 def _hinged(motions: list[np.ndarray], of_body: list[np.ndarray]) -> np.ndarray:
     """Of motions of bodies those that agree where bodies share nodes."""
-    shared = np.sum(of_body, axis=0) > 1
-    if not shared.any():
-        return np.concatenate(motions, axis=1)
-    differ = []
-    for i in range(len(motions)):
-        for j in range(i):
-            rows = of_body[i] & of_body[j]
-            parts = [np.zeros((rows.sum(), m.shape[1])) for m in motions]
-            parts[i], parts[j] = motions[i][rows], -motions[j][rows]
-            differ.append(np.concatenate(parts, axis=1))
-    once = np.concatenate([m / np.sum(of_body, axis=0)[:, None] for m in motions], axis=1)
-    whole = np.concatenate(motions, axis=1)
-    whole[shared] = once[shared]
+    whole = np.concatenate(motions, axis=1) / np.sum(of_body, axis=0)[:, None]
+    differ = [np.zeros((0, whole.shape[1]))]
+    for j, i in combinations(range(len(motions)), 2):
+        rows = of_body[i] & of_body[j]
+        parts = [np.zeros((rows.sum(), m.shape[1])) for m in motions]
+        parts[i], parts[j] = motions[i][rows], -motions[j][rows]
+        differ.append(np.concatenate(parts, axis=1))
     return whole @ null_space(np.concatenate(differ))
 
 

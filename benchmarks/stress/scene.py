@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 
@@ -117,12 +118,7 @@ class Scene:
     @property
     def surfaces(self) -> dict[str, int]:
         """Names of all sides of all bodies, with their tags."""
-        sides = [
-            (b, axis, end)
-            for b in range(len(self.bodies))
-            for axis in range(self.gdim)
-            for end in (0, 1)
-        ]
+        sides = product(range(len(self.bodies)), range(self.gdim), (0, 1))
         return {side_name(side): tag for tag, side in enumerate(sides, start=1)}
 
 
@@ -136,16 +132,12 @@ def wall_distance(wall: Wall, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Signed distance (or a level function) and its gradient at points of shape (3, n)."""
     vectors = [np.pad(np.array(v, dtype=float), (0, 3 - min(3, len(v)))) for v in wall.data]
     offset = x - vectors[0][:, None]
-    if wall.kind == "plane":
-        normal = vectors[1] / np.linalg.norm(vectors[1])
-        return normal @ offset, np.repeat(normal[:, None], x.shape[1], axis=1)
     if wall.kind in ("ball", "bowl"):
         sign = 1.0 if wall.kind == "ball" else -1.0
         length = np.linalg.norm(offset, axis=0)
         return sign * (length - wall.data[1][0]), sign * offset / length
     normal = vectors[1] / np.linalg.norm(vectors[1])
-    height = normal @ offset
+    height, curvature = normal @ offset, wall.data[2][0] if wall.kind == "bump" else 0.0
     along = offset - np.outer(normal, height)
-    curvature = wall.data[2][0]
     gradient = normal[:, None] + curvature * along  # the bump falls off on all sides
     return height + 0.5 * curvature * np.sum(along**2, axis=0), gradient

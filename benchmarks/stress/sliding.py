@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgWarning, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
+from benchmarks.stress.conditions import Conditions
 from benchmarks.stress.solve import UnsettledError
 
 SETTLED = 1e-10  # last change
@@ -18,27 +18,15 @@ BROKEN = 1e-6  # of the largest force: by so much may forces leave the law
 MOST = 100
 
 
-@dataclass
-class Law:
-    """Conditions on the free unknowns."""
-
-    N: csr_array  # conditions N u ≤ gap, shape ``(c, n)``
-    T: csr_array  # slips T u + slip, shape ``(c (gdim - 1), n)``
-    gap: np.ndarray  # shape ``(c,)``
-    slip: np.ndarray  # what prescribed values slip by, shape ``(c (gdim - 1),)``
-    given: np.ndarray  # bounds of Tresca's law
-    coefficient: np.ndarray  # of Coulomb's law
-
-
 def solve_sliding(
-    K: csr_array, f: np.ndarray, law: Law
+    K: csr_array, f: np.ndarray, law: Conditions
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """K u + Nᵀλ + Tᵀτ = f, λ ≥ 0, N u ≤ gap; ‖τ_i‖ ≤ given_i or coefficient_i λ_i along the slip.
 
     Args:
         K: Stiffness.
         f: Load.
-        law: The conditions, sparse.
+        law: The conditions, sparse, with ``slip``.
 
     Returns:
         u, λ, and τ of shape ``(c, gdim - 1)``.
