@@ -17,7 +17,7 @@ from tfeti_dolfinx.contact.shapes import distance_and_gradient
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Data
-from tfeti_dolfinx.forms.dirichlet import Prescribed
+from tfeti_dolfinx.forms.dirichlet import Prescribed, prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import diameter, group_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -53,15 +53,16 @@ class ContactSearch:
         tools: Tools | None = None,
         prescribed: Prescribed | None = None,
     ) -> None:
-        self._tools, self._prescribed = tools, prescribed
-        self._dofs, self._origin, decomposition = dofs, origin, dofs.decomposition
+        self._tools, self._dofs, self._origin = tools, dofs, origin
+        self._prescribed = prescribe(dofs, []) if prescribed is None else prescribed
+        decomposition = dofs.decomposition
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
         self._reach = list(self._depths)
         check_together(contacts, decomposition)
         settled = [
-            contact.settled(dofs, i, self._reach[i], stiffness, prescribed)
+            contact.settled(dofs, i, self._reach[i], stiffness, self._prescribed)
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
