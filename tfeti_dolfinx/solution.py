@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem, geometry
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
-from tfeti_dolfinx.common.parallel import any_rank, largest
+from tfeti_dolfinx.common.parallel import any_rank, largest, maxima, summed
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -185,7 +184,7 @@ class Solution:
                 sigma = stress.eval(x[place], cells).reshape(-1, 3, 3)[:, :d, :d]
             np.add.at(total, place, value_row(u.eval(x[place], cells).reshape(-1, d), sigma))
         # means of the subdomains that share a point
-        mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        total = summed(mesh.comm, total)
         with np.errstate(invalid="ignore"):
             mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
         return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
@@ -504,8 +503,7 @@ class Solution:
         records, found = self.gluing.records, np.zeros((2, len(self.contacts)))
         hardly = (records.covered < SEARCH.believed).astype(int)
         np.maximum.at(found, (hardly, records.contact), self.contact_pressure)
-        self.dofs.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
-        return found
+        return maxima(self.dofs.comm, found)
 
     @cached_property
     def area(self) -> Array:

@@ -38,9 +38,7 @@ def any_rank(comm: MPI.Intracomm, flag: bool | Array) -> bool:
     own = flag.any() if isinstance(flag, np.ndarray) else flag
     if comm.size == 1:
         return bool(own)
-    found = np.array([own], dtype=int)
-    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
-    return bool(found[0])
+    return bool(maxima(comm, np.array([own], dtype=int))[0])
 
 
 def summed(comm: MPI.Intracomm, values: Array) -> Array:
@@ -57,8 +55,7 @@ def count_over(comm: MPI.Intracomm, flags: Array | int) -> int:
 
 def dot_over(comm: MPI.Intracomm, *pairs: tuple[Array, Array]) -> list[float]:
     """xᵀy of pairs of vectors that are spread over ranks, rank 0's on each. Collective."""
-    products = np.array([x @ y for x, y in pairs])
-    comm.Allreduce(MPI.IN_PLACE, products, op=MPI.SUM)
+    products = summed(comm, np.array([x @ y for x, y in pairs]))
     comm.Bcast(products, root=0)
     return [float(value) for value in products]
 
@@ -68,18 +65,21 @@ def norm_over(comm: MPI.Intracomm, x: Array) -> float:
     return float(np.sqrt(dot_over(comm, (x, x))[0]))
 
 
+def maxima(comm: MPI.Intracomm, values: Array) -> Array:
+    """Return the largest of all ranks' values, entry by entry: one reduction. Collective."""
+    found = np.array(values)
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+    return found
+
+
 def largest(comm: MPI.Intracomm, x: Array) -> float:
     """Largest modulus of a vector that is spread over ranks, 0 if it is empty. Collective."""
-    found = np.array([np.abs(x).max(initial=0.0)], dtype=float)
-    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
-    return float(found[0])
+    return float(maxima(comm, np.array([np.abs(x).max(initial=0.0)], dtype=float))[0])
 
 
 def least(comm: MPI.Intracomm, value: float) -> float:
     """Return the least of all ranks' values. Collective."""
-    found = np.array([value], dtype=float)
-    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MIN)
-    return float(found[0])
+    return -float(maxima(comm, np.array([-value], dtype=float))[0])
 
 
 def joined_over(comm: MPI.Intracomm, own: Array) -> Array:
@@ -165,8 +165,6 @@ def chunk_offsets(comm: MPI.Intracomm, size: int) -> Array:
 
 def box_over_ranks(comm: MPI.Intracomm, x: Array) -> tuple[Array, Array]:
     """Lowest and highest coordinates of all ranks' points, shapes ``(gdim,)``. Collective."""
-    low = np.array([column.min(initial=np.inf) for column in x.T])
-    high = np.array([column.max(initial=-np.inf) for column in x.T])
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    return low, high
+    ends = [(-column.min(initial=np.inf), column.max(initial=-np.inf)) for column in x.T]
+    low, high = maxima(comm, np.array(ends)).T
+    return -low, high

@@ -5,10 +5,9 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, maxima, summed
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, Obstacle, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
@@ -96,19 +95,6 @@ class ContactSearch:
         pairs = zip(self.contacts, self._records, strict=True)
         found = [friction_values(c.name, c.friction, records, self._dofs) for c, records in pairs]
         return np.concatenate([none, *found])
-
-    def sees(self, changed: Array) -> bool:
-        """Return whether flags of owned groups' components have one where it makes other rows.
-
-        On surfaces of a pair, and of degree above 1 on that of an obstacle.
-        """
-        dofs = self._dofs
-        if not any_rank(dofs.comm, changed):
-            return False
-        bends = dofs.V.element.basix_element.degree > 1
-        found = [nodes for both in self._nodes if bends or len(both) > 1 for nodes in both]
-        groups = dofs.group[np.concatenate([np.empty(0, dtype=np.int64), *found])]
-        return any_rank(dofs.comm, dofs.lookup(groups, changed)[0])
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
         """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
@@ -250,8 +236,7 @@ class ContactSearch:
         own = np.sum([np.append(part.sum(axis=0), len(part)) for part in moved], axis=0)
         *total, count = summed(comm, own)
         squares = [np.sum((u - np.divide(total, count)) ** 2, axis=1) for u in moved]
-        largest = np.sqrt([square.max(initial=0.0) for square in squares])
-        comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+        largest = maxima(comm, np.sqrt([square.max(initial=0.0) for square in squares]))
         return bcast_from_root(comm, float(largest.sum()))
 
     def _search(self, i: int, reach: float) -> ContactRecords:
