@@ -10,6 +10,7 @@ from dolfinx import fem, geometry
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, largest, maxima, summed
+from tfeti_dolfinx.common.validation import named, real_numbers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -143,12 +144,8 @@ class Solution:
         mesh, u = self.decomposition.mesh, self.displacement
         with agreeing(self.dofs.comm, "at") as given:
             gdim = mesh.geometry.dim
-            try:
-                points = np.array(points, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise InputError(
-                    f"points: {error}; expected numbers of shape (k, {gdim})"
-                ) from error
+            with named("points", TypeError, ValueError):
+                points = real_numbers(points)
             if points.ndim != 2 or points.shape[1] != gdim or not np.all(np.isfinite(points)):
                 raise InputError(
                     f"points of shape {points.shape}; expected finite numbers of shape (k, {gdim})"
@@ -471,7 +468,7 @@ class Solution:
         """Slips along tangents that are prescribed, else no numbers; collective at first use."""
         if self.friction is None:
             return np.full(self.gluing.slip.shape, np.nan)
-        slip = self.gluing.prescribed_slip()
+        slip = np.where(self.gluing.forced(), self.gluing.given_slip, np.nan)
         slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
         return slip
 
