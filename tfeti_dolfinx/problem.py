@@ -343,9 +343,8 @@ class ContactProblem:
 
     def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
         system, tools = self._system, self._system.tools
-        if tools:
-            motion = tools.motion(gluing.records, found=True)
-            gluing = replace(gluing, records=replace(gluing.records, motion=motion))
+        motion = tools.motion(gluing.records, found=True)
+        gluing = replace(gluing, records=replace(gluing.records, motion=motion))
         solution = Solution(
             u=u,
             lam=lam,

@@ -342,7 +342,7 @@ class System(Generic[OwnForms]):
             search.length,
             self.weights,
             slip=self._slip(),
-            tools=tools if tools.num_unknowns else None,
+            tools=tools,
         )
 
     def _fill_right_side(self) -> None:
@@ -396,8 +396,8 @@ class System(Generic[OwnForms]):
             subdomain_data(dofs, self._K, self._f, trace),
             dofs,
             self._equals,
+            self.tools,
             self.elements.blocks,
-            self.tools if self.tools.num_unknowns else None,
             self.follows,
         )
         self._K, self._subdomains.tangents = None, self.follows
@@ -431,8 +431,6 @@ class System(Generic[OwnForms]):
             names = ("frame", "condition", "entry_group", "weight")
             same = all(np.array_equal(getattr(records, n), getattr(before, n)) for n in names)
             if not any_rank(self._dofs.comm, not same):
-                if not self.tools:
-                    return slip, slip
                 # of the points of rigid bodies that are there now
                 way = before.motion - self.tools.motion_at_begin(records)
                 return (slip + np.einsum("ntg,ng->nt", records.tangents, way),) * 2

@@ -263,16 +263,16 @@ def glue(
     rows are orthonormal in the inner product of D⁻¹ as far as they can be.
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
-    rigid = tools.entries(records) if tools else None
+    tools = Tools([], dofs) if tools is None else tools
+    rigid = tools.entries(records)
     builder = RowBuilder(dofs, prescribed, D, records, rigid)
     normal_rows, sliding_rows, contact = contact_rows(dofs, builder)
-    if tools and rigid:
+    if tools.num_unknowns:
         decided = np.intersect1d(contact.decided, rigid.condition)
         tools.check_nodes(records.contact[decided])
     equalities, to_equalities = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
-    count = tools.num_unknowns if tools else 0
-    constraints = assemble_constraints(dofs, tables, weights, contact, count)
+    constraints = assemble_constraints(dofs, tables, weights, contact, tools.num_unknowns)
     still, drawn = np.zeros(records.tangents.shape[:2]), np.zeros_like(contact.moves)
     gluing = Gluing(dofs, prescribed, records, to_equalities, constraints, length, still, drawn)
     try:

@@ -52,7 +52,8 @@ class ContactSearch:
         tools: Tools | None = None,
         prescribed: Prescribed | None = None,
     ) -> None:
-        self._tools, self._dofs, self._origin = tools, dofs, origin
+        self._dofs, self._origin = dofs, origin
+        self._tools = Tools(contacts, dofs) if tools is None else tools
         self._prescribed = prescribe(dofs, []) if prescribed is None else prescribed
         decomposition = dofs.decomposition
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
@@ -151,8 +152,7 @@ class ContactSearch:
 
     def move(self) -> None:
         """Let rigid bodies be where their laws have them now."""
-        if self._tools:
-            self._records = [replace(r, motion=self._tools.motion(r)) for r in self._records]
+        self._records = [replace(r, motion=self._tools.motion(r)) for r in self._records]
 
     def take_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
         """Have the rows that an earlier search of the same scene had, as ``rows`` said."""
@@ -192,9 +192,7 @@ class ContactSearch:
         return count
 
     def _overlapping(self, found: ContactRecords, u: Array, tolerance: float) -> Array:
-        there = found
-        if self._tools:
-            there = replace(found, motion=self._tools.motion(found, found=True))
+        there = replace(found, motion=self._tools.motion(found, found=True))
         v = relative_displacement(there, self._dofs, u)
         return np.asarray(found.gap - np.sum(found.normal * v, axis=1) < -tolerance)
 
@@ -248,14 +246,10 @@ class ContactSearch:
 
     def _from_origin(self, i: int, found: ContactRecords) -> ContactRecords:
         """Conditions of contact i with the gaps of the total displacement."""
-        if self._tools:  # at their places
-            found = replace(found, motion=self._tools.motion_there(found))
+        found = replace(found, motion=self._tools.motion_there(found))  # at their places
+        way = -found.motion
         if self._origin is not None:
             nodes, facets = self._origin
             here = facets if len(self.contacts[i].surfaces) > 1 else nodes
             way = relative_displacement(found, self._dofs, here)
-        elif self._tools:
-            way = -found.motion
-        else:
-            return found
         return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))
