@@ -100,8 +100,8 @@ class System(Generic[OwnForms]):
         self.origin: Array | None = None
         self.tools, self.time = Tools(contacts, dofs), 0.0
         self.tools.check_mass(forms.has_mass)
-        # displacement in primal order at which the load step begins; None: no displacement
-        self._rest: Array | None = None
+        # displacement in primal order at which the load step begins
+        self._rest: Array = np.zeros(dofs.num_nodes * dofs.bs)
         self._known_slips: tuple[ContactRecords, Array] | None = None
         self._stale, self._made = set(STAGES), Counter[str]()
         self.how, self._counted = settings.inverses(), 0
@@ -231,8 +231,7 @@ class System(Generic[OwnForms]):
 
     def begun(self) -> Array:
         """Return where the load step began, with free motions of rigid bodies, shape ``(n,)``."""
-        rest = np.zeros(self.subdomains.num_nodal) if self._rest is None else self._rest
-        return np.append(rest, self.tools.at_begin()[: self.tools.num_local])
+        return np.append(self._rest, self.tools.at_begin()[: self.tools.num_local])
 
     def rows(self) -> KnownRows | None:
         """Return the rows that the last search ended with; None before the first."""
@@ -424,8 +423,6 @@ class System(Generic[OwnForms]):
     def _slip(self) -> tuple[Array, Array]:
         """Tangential v_i where the load step begins, and those of prescribed components alone."""
         records = self.search.records
-        if self._rest is None:
-            return (np.zeros(records.tangents.shape[:2]),) * 2
         if self._known_slips is not None:
             before, slip = self._known_slips
             names = ("frame", "condition", "entry_group", "weight")
