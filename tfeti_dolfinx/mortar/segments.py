@@ -320,7 +320,7 @@ class _Planes:
     def first_layer(self, found: _Meetings) -> Array:
         """Return the pairs with no other primary facet before theirs."""
         covered = np.bincount(found.s, found.parts.size, minlength=len(self.size))
-        twice = covered > (1.0 + SEARCH.covered_twice) * self.size
+        twice = covered > (1.0 + SEARCH.uncovered) * self.size
         several = np.flatnonzero(twice[found.s])
         a, there = self._over(found, several, several)
         first = np.ones(len(found.s), dtype=bool)
