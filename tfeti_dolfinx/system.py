@@ -205,7 +205,7 @@ class System(Generic[OwnForms]):
         Conditions stay, but for their gaps. Raise an InputError where a gap does not fit, or
         overlaps too deep; nothing has changed then.
         """
-        contacts = {i: replace(self._contacts[i], gap=gap) for i, gap in gaps.items()}
+        contacts = {i: self._contacts[i].with_gap(gap) for i, gap in gaps.items()}
         if self._search is not None:
             self._search.set_gaps(gaps)
         for i, contact in contacts.items():

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from numbers import Real
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
 
@@ -70,15 +70,6 @@ class ContactPartner(ABC):
         if self.friction is not None:
             expected = "Tresca(bound), Coulomb(coefficient) or None"
             checked_type(self.friction, FrictionLaw, f"{self.name}: friction", expected)
-        gap = self.gap
-        number = isinstance(gap, Real) and not isinstance(gap, bool) and np.isfinite(float(gap))
-        known = isinstance(gap, str) and gap in (GEOMETRY, CURVED)
-        if not (number or known or is_of_points(f"{self.name}: gap", gap)):
-            raise InputError(
-                f'{self.name}: gap={gap!r}, expected "geometry", "curved", a finite length '
-                "(negative: interference), a dolfinx.fem.Constant or Function of lengths, or a "
-                "function of points of shape (3, n)"
-            )
 
     @property
     @abstractmethod
@@ -97,11 +88,12 @@ class ContactPartner(ABC):
         """
 
     def first_reach(self, decomposition: Decomposition) -> float:
-        """Return the first reach; raise an InputError where it or a surface does not fit."""
+        """Return the first reach; raise an InputError where it, surfaces or gap do not fit."""
         try:
             facets = [surface_facets(decomposition, name) for name in self.surfaces]
         except InputError as error:  # on all ranks
             raise InputError(f"{self.name}: {error}") from error
+        self._check_gap()
         size, reach = min(diameter(decomposition, surface) for surface in facets), self.reach
         if reach is None:
             return SEARCH.reach * size
@@ -118,6 +110,12 @@ class ContactPartner(ABC):
         ``stiffness`` is the block of K of each primal node, shape ``(num_nodes, bs, bs)``; None:
         the sides are those of an earlier search.
         """
+
+    def with_gap(self, gap: Gap) -> Self:
+        """Return the same contact with another ``gap=``."""
+        found = replace(self, gap=gap)
+        found._check_gap()
+        return found
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
         """Return gaps of its conditions, as ``gap=`` and the geometry have them, shape ``(n,)``.
@@ -140,6 +138,17 @@ class ContactPartner(ABC):
         records = with_friction(self.name, self.friction, records, dofs)
         gap = self.gaps(dofs, records, depth)
         return replace(records, gap=gap, within_reach=gap <= reach)
+
+    def _check_gap(self) -> None:
+        gap = self.gap
+        number = isinstance(gap, Real) and not isinstance(gap, bool) and np.isfinite(float(gap))
+        known = isinstance(gap, str) and gap in (GEOMETRY, CURVED)
+        if not (number or known or is_of_points(f"{self.name}: gap", gap)):
+            raise InputError(
+                f'{self.name}: gap={gap!r}, expected "geometry", "curved", a finite length '
+                "(negative: interference), a dolfinx.fem.Constant or Function of lengths, or a "
+                "function of points of shape (3, n)"
+            )
 
 
 # --- Lists of contacts ------------------------------------------------------------------------

@@ -105,7 +105,7 @@ class ContactSearch:
         the geometry overlaps too deep; nothing has changed then.
         """
         given = enumerate(self.contacts)
-        contacts = [replace(c, gap=gaps[i]) if i in gaps else c for i, c in given]
+        contacts = [c.with_gap(gaps[i]) if i in gaps else c for i, c in given]
         self._take_gaps(contacts, gaps)
         self.contacts = contacts
 
