@@ -46,7 +46,7 @@ from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod, Subdomains
-from tfeti_dolfinx.system import System, made
+from tfeti_dolfinx.system import System
 
 log = logging.getLogger(__name__)
 
@@ -355,7 +355,7 @@ class ContactProblem:
             thickness=self._thickness,
         )
         solution.finite, solution.boundary = system.origin is not None, system.elements.solved(u)
-        solution.tool_motions, solution.friction = tools.motions(), made(system.known_friction)
+        solution.tool_motions, solution.friction = tools.motions(), system.known_friction
         return solution
 
     # ------------------------------------------------------- after a solve

@@ -74,7 +74,7 @@ class Solution:
         has_contact: True if the problem has contacts.
         has_friction: True if a contact of the problem has friction.
         tool_motions: Where rigid bodies are.
-        friction: Bounds or coefficients of the conditions along tangents, 0 without a law.
+        friction: Bounds or coefficients of the conditions along tangents, else None.
         thickness: What areas are multiplied with, a number or a scalar in UFL.
         finite: True where forces act at X + u, as in finite strain.
     """
@@ -99,7 +99,7 @@ class Solution:
         self.finite = False
         self.v: Array | None = None
         self.boundary: Any = None
-        self.friction: Array = np.zeros(gluing.slip.shape)
+        self.friction: Array | None = None
         self._stress_of, self.has_stress = stress, stress is not None
         self.has_contact = bool(contacts)
         self.has_friction = any(contact.friction is not None for contact in contacts)
@@ -466,6 +466,8 @@ class Solution:
     @cached_property
     def forced_slip(self) -> Array:
         """Slips along tangents that are prescribed, else no numbers; collective at first use."""
+        if self.friction is None:
+            return np.full(self.gluing.slip.shape, np.nan)
         slip = np.where(self.gluing.forced(), self.gluing.given_slip, np.nan)
         slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
         return slip
@@ -474,6 +476,8 @@ class Solution:
     def forced_friction(self) -> Array:
         """Friction of nodes that are made to slip, ``(n, gdim)``, else 0. Collective at first."""
         records = self.gluing.records
+        if self.friction is None:
+            return np.zeros(records.normal.shape)
         given = np.where(records.friction == Friction.COULOMB, self.force, self.area)
         bound = self.friction * given[:, None]
         pull = bound * self.forced_slip

@@ -329,10 +329,11 @@ class System(Generic[OwnForms]):
         if self.weights is None or not self.follows:
             scaling = self._settings.options.scaling
             self.weights = row_weights(self._blocks, scaling, dofs.comm)
-        records, friction = search.records, search.friction()
-        self.known_friction, rubs = friction, np.any(friction > 0.0, axis=1)
-        # a bound of 0 has no rows
-        records = replace(records, friction=np.where(rubs, records.friction, Friction.NONE))
+        records = search.records
+        if self._has_friction:  # a bound of 0 has no rows
+            friction = self.known_friction = search.friction()
+            rubs = np.any(friction > 0.0, axis=1)
+            records = replace(records, friction=np.where(rubs, records.friction, Friction.NONE))
         self._gluing = glue(
             dofs,
             made(self._prescribed),
@@ -359,7 +360,8 @@ class System(Generic[OwnForms]):
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
-        gluing.bound_friction(made(self.known_friction), area)
+        friction = made(self.known_friction) if self._has_friction else np.zeros(gluing.slip.shape)
+        gluing.bound_friction(friction, area)
 
     def _assemble_load(self) -> None:
         self._f = self.elements.load(self.forms)

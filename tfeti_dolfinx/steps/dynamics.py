@@ -76,11 +76,13 @@ def balance(
     done = -solution.lam * dual.constraints.jumps(all_way[dual.subdomains.trace])  # −λᵀB Δu
     of_rows = [done[r].sum() for r in (sets.normals, sets.tangents.ravel(), sets.equalities)]
     # rows know nothing of prescribed components: supports that draw nodes bear their friction
-    records = solution.gluing.records
-    along = relative_displacement(records, solution.dofs, primal) + records.motion
-    rigid = tools.entries(records)
-    np.add.at(along, rigid.condition, rigid.direction * tools.way()[rigid.unknown, None])
-    rubs = np.sum(solution.tangential_force * along) - of_rows[1]
+    rubs = 0.0
+    if solution.friction is not None:
+        records = solution.gluing.records
+        along = relative_displacement(records, solution.dofs, primal) + records.motion
+        rigid = tools.entries(records)
+        np.add.at(along, rigid.condition, rigid.direction * tools.way()[rigid.unknown, None])
+        rubs = np.sum(solution.tangential_force * along) - of_rows[1]
     of_nodes = (motion.v, motion.start, v, way, drift, 0.5 * (motion.load + inertia.ends))
     both = _kinetics(inertia.M, motion.size, *of_nodes)
     if tools.num_local:
