@@ -343,8 +343,9 @@ class ContactProblem:
 
     def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
         system, tools = self._system, self._system.tools
-        motion = tools.motion(gluing.records, found=True)
-        gluing = replace(gluing, records=replace(gluing.records, motion=motion))
+        if tools:
+            motion = tools.motion(gluing.records, found=True)
+            gluing = replace(gluing, records=replace(gluing.records, motion=motion))
         solution = Solution(
             u=u,
             lam=lam,

@@ -38,7 +38,9 @@ def any_rank(comm: MPI.Intracomm, flag: bool | Array) -> bool:
     own = flag.any() if isinstance(flag, np.ndarray) else flag
     if comm.size == 1:
         return bool(own)
-    return bool(maxima(comm, np.array([own], dtype=int))[0])
+    found = np.array([own], dtype=int)
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+    return bool(found[0])
 
 
 def summed(comm: MPI.Intracomm, values: Array) -> Array:
@@ -55,7 +57,8 @@ def count_over(comm: MPI.Intracomm, flags: Array | int) -> int:
 
 def dot_over(comm: MPI.Intracomm, *pairs: tuple[Array, Array]) -> list[float]:
     """xᵀy of pairs of vectors that are spread over ranks, rank 0's on each. Collective."""
-    products = summed(comm, np.array([x @ y for x, y in pairs]))
+    products = np.array([x @ y for x, y in pairs])
+    comm.Allreduce(MPI.IN_PLACE, products, op=MPI.SUM)
     comm.Bcast(products, root=0)
     return [float(value) for value in products]
 
@@ -74,12 +77,16 @@ def maxima(comm: MPI.Intracomm, values: Array) -> Array:
 
 def largest(comm: MPI.Intracomm, x: Array) -> float:
     """Largest modulus of a vector that is spread over ranks, 0 if it is empty. Collective."""
-    return float(maxima(comm, np.array([np.abs(x).max(initial=0.0)], dtype=float))[0])
+    found = np.array([np.abs(x).max(initial=0.0)], dtype=float)
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+    return float(found[0])
 
 
 def least(comm: MPI.Intracomm, value: float) -> float:
     """Return the least of all ranks' values. Collective."""
-    return -float(maxima(comm, np.array([-value], dtype=float))[0])
+    found = np.array([value], dtype=float)
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MIN)
+    return float(found[0])
 
 
 def joined_over(comm: MPI.Intracomm, own: Array) -> Array:

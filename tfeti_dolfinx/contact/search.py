@@ -192,7 +192,9 @@ class ContactSearch:
         return count
 
     def _overlapping(self, found: ContactRecords, u: Array, tolerance: float) -> Array:
-        there = replace(found, motion=self._tools.motion(found, found=True))
+        there = found
+        if self._tools:
+            there = replace(found, motion=self._tools.motion(found, found=True))
         v = relative_displacement(there, self._dofs, u)
         return np.asarray(found.gap - np.sum(found.normal * v, axis=1) < -tolerance)
 
