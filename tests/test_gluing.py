@@ -32,7 +32,8 @@ class Scene:
         gdim = d.mesh.geometry.dim
         self.dofs = dofs = dofs_on(d, degree)
         bcs = [clamp(dofs.V, d.facets("left"), np.arange(1.0, gdim + 1))] if clamped else []
-        found = [c.records(dofs, i, np.inf, np.inf) for i, c in enumerate(contacts)]
+        none = prescribe(dofs, [])
+        found = [c.records(dofs, i, np.inf, np.inf, none) for i, c in enumerate(contacts)]
         records = concatenate(found, gdim)
         self.weights = np.ones(dofs.num_nodes * dofs.bs) if weights is None else weights(dofs)
         self.gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, self.weights)
@@ -142,9 +143,9 @@ def test_prescribed_components_move_into_the_gap():
     slanted = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (3, 0, 4)))
     d = decomposed("hexahedron", 2, 2)
     dofs = dofs_on(d)
-    records = concatenate([slanted.records(dofs, 0, np.inf, np.inf)], 3)
-    bcs = [roller(dofs.V, 0, d.facets("bottom"), 1.0)]
-    gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
+    records = concatenate([slanted.records(dofs, 0, np.inf, np.inf, prescribe(dofs, []))], 3)
+    held = prescribe(dofs, [roller(dofs.V, 0, d.facets("bottom"), 1.0)])
+    gluing = glue(dofs, held, records, 1.0, np.ones(dofs.num_nodes * 3))
     rows = gluing.constraints.sets.normals
     gap = gluing.constraints.c[rows] / gluing.constraints.scale
     assert np.allclose(gap, records.gap[gluing.constraints.contact.normals] + 0.6 * 1.0)

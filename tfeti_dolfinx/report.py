@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import quotient, sum_rows
 from tfeti_dolfinx.common.files import written_whole
-from tfeti_dolfinx.common.parallel import largest, summed
+from tfeti_dolfinx.common.parallel import largest, maxima, summed
 from tfeti_dolfinx.common.validation import named
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import position_of
@@ -165,10 +165,10 @@ class ContactSummary:
         own = np.column_stack((*flags, solution.condition_forces))
         sums = summed(comm, sum_rows(of, own, count))
         counts, forces = sums[:, :4].T.astype(int).tolist(), sums[:, 4:].tolist()
-        least = np.full(count, np.inf)
-        np.minimum.at(least, of, solution.remaining_gap)
-        comm.Allreduce(MPI.IN_PLACE, least, op=MPI.MIN)
-        gaps = np.where(np.isfinite(least), 0.0 + least, 0.0)  # of no node; never −0
+        overlap = np.full(count, -np.inf)
+        np.maximum.at(overlap, of, -solution.remaining_gap)
+        overlap = maxima(comm, overlap)
+        gaps = np.where(np.isfinite(overlap), 0.0 - overlap, 0.0)  # of no node; never −0
         pressure, others = solution.largest_pressures
         pressure = np.where(pressure > 0.0, pressure, others)
         names = zip(*((c.name, c.surfaces[0]) for c in solution.contacts), strict=True)
@@ -419,8 +419,8 @@ def _local_operators(dual: Dual) -> dict[str, float]:
             continue
         found.update({f"{name}_{form}": count for form, count in own.items()})
         means[f"{name}_measured"] = operator.seconds / max(operator.times, 1)
-    seconds, comm = np.array(list(means.values())), dual.coarse.comm
-    comm.Allreduce(MPI.IN_PLACE, seconds, op=MPI.MAX)
+    comm = dual.coarse.comm
+    seconds = maxima(comm, np.array(list(means.values())))
     forms = {name: float(count) for name, count in sorted(comm.allreduce(found).items())}
     return forms | dict(zip(means, map(float, seconds), strict=True))
 

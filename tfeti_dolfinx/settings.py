@@ -67,8 +67,8 @@ class Settings:
         data: Iterable[SubdomainData],
         dofs: TornDofs,
         equals: EqualSubdomains,
+        tools: Tools,
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
-        tools: Tools | None = None,
         is_tangent: bool = False,
     ) -> Subdomains:
         """Make a Block of each subdomain, whose data is let go then, and one of all. Collective.
@@ -89,13 +89,13 @@ class Settings:
         make = own.block or (lambda item: SparseBlock(item, equals.factory, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
-        rigid, count = list[RigidBlock](), len(tools.free_names) if tools else 0
-        if tools and own.subdomains is not None:
+        rigid, names = list[RigidBlock](), tools.free_names
+        if names and own.subdomains is not None:
             raise InputError(
-                f"{tools.free_names[0]}: a rigid body with free motions goes with no other kind of "
+                f"{names[0]}: a rigid body with free motions goes with no other kind of "
                 "Subdomains, as clusters are; expected a motion by a law, or none of them"
             )
-        if tools and tools.num_local:  # the last rank has their Blocks
+        if tools.num_local:  # the last rank has their Blocks
             load, K, k = tools.load, tools.stiffness, tools.law.shape[1]
             rigid = [
                 RigidBlock(tools.bodies[i].name, load[at], tools.mode[at], k, K[np.ix_(at, at)])
@@ -105,10 +105,10 @@ class Settings:
             say_if_not_cholmod()
         bodies = decomposition.body_of_subdomain[decomposition.subdomains]
         bodies = np.append(bodies, decomposition.num_bodies + np.arange(len(rigid)))
-        count += decomposition.num_bodies
         with added_options(self.prefix, self.factor_options):
             with raised_on_all_ranks(dofs.comm):
                 blocks = [make(item) for item in data]
+            count = decomposition.num_bodies + len(names)
             return kind([*blocks, *rigid], bodies, count, dofs.comm, choice)
 
     def make_dual(

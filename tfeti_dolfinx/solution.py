@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem, geometry
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
-from tfeti_dolfinx.common.parallel import any_rank, largest
+from tfeti_dolfinx.common.parallel import any_rank, largest, maxima, summed
+from tfeti_dolfinx.common.validation import named, real_numbers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -142,12 +142,8 @@ class Solution:
         mesh, u = self.decomposition.mesh, self.displacement
         with agreeing(self.dofs.comm, "at") as given:
             gdim = mesh.geometry.dim
-            try:
-                points = np.array(points, dtype=float)
-            except (TypeError, ValueError) as error:
-                raise InputError(
-                    f"points: {error}; expected numbers of shape (k, {gdim})"
-                ) from error
+            with named("points", TypeError, ValueError):
+                points = real_numbers(points)
             if points.ndim != 2 or points.shape[1] != gdim or not np.all(np.isfinite(points)):
                 raise InputError(
                     f"points of shape {points.shape}; expected finite numbers of shape (k, {gdim})"
@@ -183,7 +179,7 @@ class Solution:
                 sigma = stress.eval(x[place], cells).reshape(-1, 3, 3)[:, :d, :d]
             np.add.at(total, place, value_row(u.eval(x[place], cells).reshape(-1, d), sigma))
         # means of the subdomains that share a point
-        mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        total = summed(mesh.comm, total)
         with np.errstate(invalid="ignore"):
             mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
         return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
@@ -470,7 +466,7 @@ class Solution:
         """Slips along tangents that are prescribed, else no numbers; collective at first use."""
         if self.friction is None:
             return np.full(self.gluing.slip.shape, np.nan)
-        slip = self.gluing.prescribed_slip()
+        slip = np.where(self.gluing.forced(), self.gluing.given_slip, np.nan)
         slip[np.abs(slip) < TOLERANCES.still * largest(self.dofs.comm, self.u)] = 0.0
         return slip
 
@@ -502,8 +498,7 @@ class Solution:
         records, found = self.gluing.records, np.zeros((2, len(self.contacts)))
         hardly = (records.covered < SEARCH.believed).astype(int)
         np.maximum.at(found, (hardly, records.contact), self.contact_pressure)
-        self.dofs.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
-        return found
+        return maxima(self.dofs.comm, found)
 
     @cached_property
     def area(self) -> Array:

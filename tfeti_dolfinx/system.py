@@ -88,9 +88,12 @@ class System(Generic[OwnForms]):
         self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)
         # other obstacles have normals of their own, and of degree 1 nodes see no others
+        shapes = [getattr(contact, "shape", None) for contact in contacts]  # pairs have none
+        meets = any(shape is None or has_facets(shape) for shape in shapes)
+        bends = dofs.V.element.basix_element.degree > 1
+        self._sees_conditions = meets or (bends and len(shapes) > 0)
         self._sees_symmetry = dofs.bs == dofs.V.mesh.geometry.dim and (
-            any(isinstance(c, Contact) or has_facets(getattr(c, "shape", None)) for c in contacts)
-            or (self._has_friction and dofs.V.element.basix_element.degree > 1)
+            meets or (self._has_friction and bends)
         )
         self.elements = (
             FiniteElements(dofs) if method is None else method.assembly(dofs, dofs.decomposition)
@@ -163,12 +166,10 @@ class System(Generic[OwnForms]):
         if self._values.has_changed() or given != self._conditions or "points" in changes:
             self._conditions, old = None, self._prescribed  # what raises looks again
             new = self._prescribed = prescribe(self._dofs, given, self._ends)
-            if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
-                self.change("constraints")
-            elif any_rank(comm, not np.array_equal(new.value, old.value)):
+            if old is None or any_rank(comm, new.kinds != old.kinds):
+                self.change("places" if self._sees_conditions else "constraints")
+            elif any_rank(comm, new.value != old.value):
                 self.change("right side")
-            if old and self._search and self._search.sees(new.kinds != old.kinds):
-                self.change("places")
             self._conditions = given
         if self._search is not None:
             self._look_at_values(self._search)
@@ -338,7 +339,7 @@ class System(Generic[OwnForms]):
             search.length,
             self.weights,
             slip=self._slip(),
-            tools=tools if tools.num_unknowns else None,
+            tools=tools,
         )
 
     def _fill_right_side(self) -> None:
@@ -392,8 +393,8 @@ class System(Generic[OwnForms]):
             subdomain_data(dofs, self._K, self._f, trace),
             dofs,
             self._equals,
+            self.tools,
             self.elements.blocks,
-            self.tools if self.tools.num_unknowns else None,
             self.is_tangent,
         )
         self._K, self._subdomains.is_tangent = None, self.is_tangent
@@ -427,8 +428,6 @@ class System(Generic[OwnForms]):
             names = ("frame", "condition", "entry_group", "weight")
             same = all(np.array_equal(getattr(records, n), getattr(before, n)) for n in names)
             if not any_rank(self._dofs.comm, not same):
-                if not self.tools:
-                    return slip, slip
                 # of the points of rigid bodies that are there now
                 way = before.motion - self.tools.motion_at_begin(records)
                 return (slip + np.einsum("ntg,ng->nt", records.tangents, way),) * 2

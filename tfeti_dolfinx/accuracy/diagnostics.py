@@ -9,11 +9,17 @@ from weakref import ref
 import basix
 import numpy as np
 from dolfinx import mesh as dmesh
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import EPSILON, TINY, Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.compat import geometry_degree, geometry_dofmap
-from tfeti_dolfinx.common.parallel import Exchange, any_rank, bcast_from_root, largest, summed
+from tfeti_dolfinx.common.parallel import (
+    Exchange,
+    any_rank,
+    bcast_from_root,
+    largest,
+    maxima,
+    summed,
+)
 from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.contact.records import relative_displacement
 from tfeti_dolfinx.feti.dual import Dual
@@ -259,8 +265,7 @@ class Diagnostics:
             own = shown & (records.contact == i)
             own &= change > np.maximum(LIMITS.facets * peaks[i] * gives, 0.0)
             columns = change, gives, records.curved_gap
-            most = np.array([column[own].max(initial=-np.inf) for column in columns])
-            comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
+            most = maxima(comm, np.array([c[own].max(initial=-np.inf) for c in columns]))
             if most[0] > 0.0:
                 yield (
                     f"{contact.name}: facets are straight where the surfaces are curved, and "
@@ -367,7 +372,7 @@ def _overlapping(solution: Solution) -> Iterator[str]:
         return
     depth = np.zeros(len(contacts))
     np.maximum.at(depth, records.contact, np.where(solution.force > 0.0, -records.gap, 0.0))
-    comm.Allreduce(MPI.IN_PLACE, depth, op=MPI.MAX)
+    depth = maxima(comm, depth)
     for i in np.flatnonzero(pairs & (depth > LIMITS.overlaps * largest(comm, solution.u))):
         yield (
             f"{contacts[i].name}: the surfaces overlap by up to {depth[i]:.2g} as they are meshed, "

@@ -68,6 +68,13 @@ def norm_over(comm: MPI.Intracomm, x: Array) -> float:
     return float(np.sqrt(dot_over(comm, (x, x))[0]))
 
 
+def maxima(comm: MPI.Intracomm, values: Array) -> Array:
+    """Return the largest of all ranks' values, entry by entry: one reduction. Collective."""
+    found = np.array(values)
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+    return found
+
+
 def largest(comm: MPI.Intracomm, x: Array) -> float:
     """Largest modulus of a vector that is spread over ranks, 0 if it is empty. Collective."""
     found = np.array([np.abs(x).max(initial=0.0)], dtype=float)
@@ -165,8 +172,6 @@ def chunk_offsets(comm: MPI.Intracomm, size: int) -> Array:
 
 def box_over_ranks(comm: MPI.Intracomm, x: Array) -> tuple[Array, Array]:
     """Lowest and highest coordinates of all ranks' points, shapes ``(gdim,)``. Collective."""
-    low = np.array([column.min(initial=np.inf) for column in x.T])
-    high = np.array([column.max(initial=-np.inf) for column in x.T])
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    return low, high
+    ends = [(-column.min(initial=np.inf), column.max(initial=-np.inf)) for column in x.T]
+    low, high = maxima(comm, np.array(ends)).T
+    return -low, high

@@ -25,12 +25,10 @@ class RowBuilder:
         prescribed: Prescribed,
         weights: Array,
         records: ContactRecords,
-        rigid: RigidEntries | None = None,
+        rigid: RigidEntries,
     ) -> None:
-        none = np.zeros(0, dtype=np.int64)
-        self._rigid = rigid or RigidEntries(none, none, np.zeros((0, dofs.bs)))
         sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
-        self.records, self._dofs, self._weights = records, dofs, weights
+        self.records, self._dofs, self._weights, self._rigid = records, dofs, weights, rigid
         self._prescribed, self._total = dofs.lookup(records.entry_group, prescribed.flag, sums)
         # tangents across a plane of symmetry, where nothing slips, shape (n, gdim - 1)
         self.across = np.zeros(records.tangents.shape[:2], dtype=bool)

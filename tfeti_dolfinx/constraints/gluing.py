@@ -121,7 +121,7 @@ class Gluing:
         c[sets.normals] = left[rows.normals] * rows.scale
         if self.constraints.contact_rows[1]:
             along, at = np.einsum("ntg,ng->nt", records.tangents, held), rows.points
-            slips = np.where(rows.moves, (self.slip - along)[at], -self._given_slip[at])
+            slips = np.where(rows.moves, (self.slip - along)[at], -self.given_slip[at])
             slides = rows.moves | self.drawn
             c[sets.tangents] = np.where(slides, slips * rows.tangent_scale[:, None], 0.0)
         return c
@@ -145,16 +145,11 @@ class Gluing:
         at, (_, left, rounding) = self.constraints.contact.decided, self._held
         return np.asarray(at[np.abs(left[at]) <= rounding[at]])
 
-    def prescribed_slip(self) -> Array:
-        """Return slips along tangents that are prescribed, so have no row, ``(n, gdim - 1)``.
+    def forced(self) -> Array:
+        """Return flags of tangents that are prescribed, so have no row, ``(n, gdim - 1)``.
 
-        They are those of conditions with friction and a normal row; others are not numbers.
-        Collective.
+        They are those of conditions with friction and a normal row.
         """
-        return np.where(self._forced(), self._given_slip, np.nan)
-
-    def _forced(self) -> Array:
-        """Return flags of tangents that are prescribed, of conditions with friction and a row."""
         forced, rows = np.zeros(self.slip.shape, dtype=bool), self.constraints.contact
         forced[rows.normals] = True
         forced[self.records.friction == Friction.NONE] = False
@@ -162,7 +157,7 @@ class Gluing:
         return forced
 
     @cached_property
-    def _given_slip(self) -> Array:
+    def given_slip(self) -> Array:
         """Slips of prescribed components, ``(n, gdim - 1)``. Collective at first use."""
         flag, value = self.prescribed.flag, self.prescribed.value
         return given_slips(self.records, self.dofs, flag, value) - self.slip
@@ -192,7 +187,7 @@ class Gluing:
         """
         flag, slip = self.prescribed.flag, self.slip
         if begin is not None:
-            slip = np.where(self._forced(), begin[1], begin[0])
+            slip = np.where(self.forced(), begin[1], begin[0])
         gluing = replace(
             self,
             prescribed=replace(self.prescribed, value=np.where(flag, values, 0.0)),
@@ -211,7 +206,7 @@ class Gluing:
         values, motion = self.prescribed.value, self.records.motion
         known = np.concatenate([x.ravel() for x in (values, motion, self.slip)])
         least_slip = TOLERANCES.still * largest(self.dofs.comm, known)
-        slips = np.abs(self._given_slip[at]) > least_slip
+        slips = np.abs(self.given_slip[at]) > least_slip
         return ~moves & np.any(moves, axis=1)[:, None] & slips
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
@@ -278,16 +273,16 @@ def glue(
     rows are orthonormal in the inner product of D⁻¹ as far as they can be.
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
-    rigid = tools.entries(records) if tools else None
+    tools = Tools([], dofs) if tools is None else tools
+    rigid = tools.entries(records)
     builder = RowBuilder(dofs, prescribed, D, records, rigid)
     normal_rows, sliding_rows, contact = contact_rows(dofs, builder)
-    if tools and rigid:
+    if tools.num_unknowns:
         decided = np.intersect1d(contact.decided, rigid.condition)
         tools.check_nodes(records.contact[decided])
     equalities, to_equalities = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
-    count = tools.num_unknowns if tools else 0
-    constraints = assemble_constraints(dofs, tables, weights, contact, count)
+    constraints = assemble_constraints(dofs, tables, weights, contact, tools.num_unknowns)
     still, drawn = np.zeros(records.tangents.shape[:2]), np.zeros_like(contact.moves)
     gluing = Gluing(dofs, prescribed, records, to_equalities, constraints, length, still, drawn)
     try:

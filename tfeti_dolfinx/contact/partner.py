@@ -51,7 +51,6 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 Gap: TypeAlias = "str | Value"
 # what the geometry has for a gap: the distance of facets, or of the smooth surfaces through them
 GEOMETRY, CURVED = "geometry", "curved"
-Held: TypeAlias = Prescribed | None  # what Dirichlet conditions prescribe; None: nothing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +78,7 @@ class ContactPartner(ABC):
 
     @abstractmethod
     def records(
-        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Held = None
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Prescribed
     ) -> ContactRecords:
         """Return the conditions; raise an InputError where a surface, shape, gap or law is unfit.
 
@@ -104,7 +103,7 @@ class ContactPartner(ABC):
 
     @abstractmethod
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Held = None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Prescribed
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact with its sides decided, and its conditions up to a reach, and so deep.
 
@@ -262,7 +261,7 @@ class Obstacle(ContactPartner):
         return (self.surface,)
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Held = None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Prescribed
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact and its conditions. Collective.
 
@@ -286,7 +285,7 @@ class Obstacle(ContactPartner):
             )
 
     def records(
-        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Held = None
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Prescribed
     ) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective.
 
@@ -294,7 +293,7 @@ class Obstacle(ContactPartner):
         given), it is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i: of degree 1
         n·u ≤ g at the node, as ψ_i is biorthogonal to the shape functions.
         """
-        kind, across = facet_kind(dofs), held.across if held else None
+        kind, across = facet_kind(dofs), held.across
         facets = local_facets(dofs, dofs.decomposition.facets(self.surface), kind, across)
         corners = facets.corners
         with raised_on_all_ranks(dofs.comm):
@@ -313,7 +312,7 @@ class Obstacle(ContactPartner):
             normals = np.where(share < 1.0, inside / share, normals)
             distance = distance / dofs.lookup(vertices, share)[0].ravel()
         if not (isinstance(self.shape, RigidBody) and self.shape.free):
-            facets = with_held_vertices(facets, dofs, normals, held.flag if held else None)
+            facets = with_held_vertices(facets, dofs, normals, held.flag)
         share, edges = shares_at_edges(facets, dofs, towards, across)
         side = Side(facets, hat_areas(kind, facets), normals, edges)
         integrals = integrate_distance(kind, facets, distance.reshape(corners.shape[:2]), share)
@@ -423,7 +422,7 @@ class Contact(ContactPartner):
         return min(reach, diameter(decomposition))
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Held = None
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Prescribed
     ) -> tuple[Contact, ContactRecords]:
         """Return the contact with its secondary side as ``a``, and its conditions. Collective.
 
@@ -442,14 +441,13 @@ class Contact(ContactPartner):
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
         exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0
         auto, finite = self.secondary == "auto", dofs.nodes is not None
-        if (little := not _is_believed(found, dofs)) or (auto and (exchange or finite)):
+        cover = _cover(found, dofs)
+        if not cover[0] or (auto and (exchange or finite)):
             other = settled._meet(sides[::-1], dofs, contact, reach, reach, held)
-            useful = _is_believed(other, dofs)  # `little` is so of the other side, too, or not
-            better = useful if useful == little else _is_better(other, found, dofs, exchange)
-            if better and auto:
-                settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
-                found = other
-            elif little and useful and dofs.comm.rank == 0:
+            of_other = _cover(other, dofs)
+            if auto and (of_other, exchange) > (cover, False):
+                settled, found = replace(settled, a=settled.b, b=settled.a), other
+            elif not auto and of_other[0] and not cover[0] and dofs.comm.rank == 0:
                 log.warning(LITTLE, self.name, settled.b, settled.a, settled.b)
         worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
         if worse and not auto and dofs.comm.rank == 0:
@@ -457,7 +455,7 @@ class Contact(ContactPartner):
         return settled, found
 
     def records(
-        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Held = None
+        self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Prescribed
     ) -> ContactRecords:
         """One condition per node of ``a`` opposite to ``b``. Collective.
 
@@ -477,7 +475,7 @@ class Contact(ContactPartner):
             )
         return found
 
-    def _sides(self, dofs: TornDofs, held: Held) -> tuple[Side, Side]:
+    def _sides(self, dofs: TornDofs, held: Prescribed) -> tuple[Side, Side]:
         """Facets of both surfaces, with averaged normals and curvature."""
         gdim = dofs.V.mesh.geometry.dim
         if dofs.bs != gdim:
@@ -485,7 +483,7 @@ class Contact(ContactPartner):
                 f"{self.name}: the space is scalar; expected displacements of {gdim} components, "
                 "since surfaces meet along normals"
             )
-        sides, kind, across = [], facet_kind(dofs), held.across if held else None
+        sides, kind, across = [], facet_kind(dofs), held.across
         for surface in self.surfaces:
             facets = local_facets(dofs, dofs.decomposition.facets(surface), kind, across)
             whole = facets.radius ** (dofs.bs - 1)
@@ -493,7 +491,7 @@ class Contact(ContactPartner):
                 raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")
             facets, normals, edges = with_averaged_normals(facets, dofs, across)
             facets = with_curvature(facets, dofs, kind, across)
-            facets = with_held_vertices(facets, dofs, normals, held.flag if held else None)
+            facets = with_held_vertices(facets, dofs, normals, held.flag)
             areas, facets = hat_areas(kind, facets), apart_at_edges(facets, dofs, edges)
             sides.append(Side(facets, areas, normals, edges))
         return sides[0], sides[1]
@@ -505,10 +503,10 @@ class Contact(ContactPartner):
         contact: int,
         reach: float,
         depth: float,
-        held: Held,
+        held: Prescribed,
     ) -> ContactRecords:
         """Return conditions from integrals over the first side's facets that face the second."""
-        kind, comm, across = facet_kind(dofs), dofs.comm, held.across if held else None
+        kind, comm, across = facet_kind(dofs), dofs.comm, held.across
         moved, curved = dofs.nodes is not None, self.gap == CURVED
         distance = max(height := SEARCH.seen * reach, deep := SEARCH.seen * depth)
         own, edges, aside = sides[0], (sides[0].edges, sides[1].edges), False
@@ -547,21 +545,14 @@ class Contact(ContactPartner):
         return replace(self, a=self.b, b=self.a) if named else self
 
 
-def _is_believed(records: ContactRecords, dofs: TornDofs) -> bool:
-    """Return whether the other side covers enough of a node for its pressure. Collective."""
-    return any_rank(dofs.comm, records.covered >= SEARCH.believed)
+def _cover(records: ContactRecords, dofs: TornDofs) -> tuple[bool, bool]:
+    """Return whether the other side covers enough of a node for its pressure. Collective.
 
-
-def _is_better(other: ContactRecords, found: ContactRecords, dofs: TornDofs, coarser: bool) -> bool:
-    """Return whether the other side is the better secondary one. Collective.
-
-    In finite strain what is covered in part decides where it is so on one side alone.
+    And, in finite strain, whether it covers all nodes wholly.
     """
-    if dofs.nodes is None:
-        return coarser
-    whole = 1.0 - SEARCH.hardly_covered
-    partly = [any_rank(dofs.comm, r.within_reach & (r.covered < whole)) for r in (other, found)]
-    return partly[1] if partly[0] != partly[1] else coarser
+    partly = records.within_reach & (records.covered < 1.0 - SEARCH.hardly_covered)
+    whole = dofs.nodes is not None and not any_rank(dofs.comm, partly)
+    return any_rank(dofs.comm, records.covered >= SEARCH.believed), whole
 
 
 def _written(surface: object) -> str:
@@ -586,10 +577,9 @@ def _ratios(
         meets[:] = True
     sums = []
     for side in sides:
-        vertices = side.facets.vertices.ravel()
-        v = side.areas.shape[1]
-        area = dofs.reduce_on_owners(vertices, np.repeat(side.facets.area / v, v))
-        facets = dofs.reduce_on_owners(vertices, np.full(len(vertices), 1.0 / v))
+        of, v = side.facets, side.areas.shape[1]
+        parts = (np.repeat(of.area[:, None] / v, v, axis=1), np.full(side.areas.shape, 1.0 / v))
+        area, facets = (of.on_groups(dofs, part) for part in parts)
         at = meets & (area > 0.0)
         n = side.normals[at]
         along = np.einsum("gi,gij,gj", n, blocks[at], n)

@@ -198,11 +198,10 @@ def conditions(
     """
     owners = dofs.owners_of(integrals.vertices.ravel())
     area = dofs.reduced(owners, integrals.covered.ravel())
-    whole = dofs.reduce_on_owners(side.facets.vertices.ravel(), side.areas.ravel())
+    whole = side.facets.on_groups(dofs, side.areas)
     met = area > SEARCH.hardly_covered * whole
     if other is not None:
-        vertices = other.facets.vertices.ravel()
-        met &= dofs.reduce_on_owners(vertices, np.ones(len(vertices))) == 0.0
+        met &= other.facets.on_groups(dofs, np.ones(other.areas.shape)) == 0.0
     chosen = np.flatnonzero(met)
     areas = area[chosen]
     # what rounding of coordinates may make of a gap

@@ -5,10 +5,9 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, count_over, maxima, summed
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, Obstacle, check_together
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, relative_displacement
@@ -17,7 +16,7 @@ from tfeti_dolfinx.contact.shapes import distance_and_gradient
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Data
-from tfeti_dolfinx.forms.dirichlet import Prescribed
+from tfeti_dolfinx.forms.dirichlet import Prescribed, prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import diameter, group_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -53,15 +52,17 @@ class ContactSearch:
         tools: Tools | None = None,
         prescribed: Prescribed | None = None,
     ) -> None:
-        self._tools, self._prescribed = tools, prescribed
-        self._dofs, self._origin, decomposition = dofs, origin, dofs.decomposition
+        self._dofs, self._origin = dofs, origin
+        self._tools = Tools(contacts, dofs) if tools is None else tools
+        self._prescribed = prescribe(dofs, []) if prescribed is None else prescribed
+        decomposition = dofs.decomposition
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
         self._reach = list(self._depths)
         check_together(contacts, decomposition)
         settled = [
-            contact.settled(dofs, i, self._reach[i], stiffness, prescribed)
+            contact.settled(dofs, i, self._reach[i], stiffness, self._prescribed)
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
@@ -95,19 +96,6 @@ class ContactSearch:
         pairs = zip(self.contacts, self._records, strict=True)
         found = [friction_values(c.name, c.friction, records, self._dofs) for c, records in pairs]
         return np.concatenate([none, *found])
-
-    def sees(self, changed: Array) -> bool:
-        """Return whether flags of owned groups' components have one where it makes other rows.
-
-        On surfaces of a pair, and of degree above 1 on that of an obstacle.
-        """
-        dofs = self._dofs
-        if not any_rank(dofs.comm, changed):
-            return False
-        bends = dofs.V.element.basix_element.degree > 1
-        found = [nodes for both in self._nodes if bends or len(both) > 1 for nodes in both]
-        groups = dofs.group[np.concatenate([np.empty(0, dtype=np.int64), *found])]
-        return any_rank(dofs.comm, dofs.lookup(groups, changed)[0])
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
         """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
@@ -164,8 +152,7 @@ class ContactSearch:
 
     def move(self) -> None:
         """Let rigid bodies be where their laws have them now."""
-        if self._tools:
-            self._records = [replace(r, motion=self._tools.motion(r)) for r in self._records]
+        self._records = [replace(r, motion=self._tools.motion(r)) for r in self._records]
 
     def take_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
         """Have the rows that an earlier search of the same scene had, as ``rows`` said."""
@@ -249,8 +236,7 @@ class ContactSearch:
         own = np.sum([np.append(part.sum(axis=0), len(part)) for part in moved], axis=0)
         *total, count = summed(comm, own)
         squares = [np.sum((u - np.divide(total, count)) ** 2, axis=1) for u in moved]
-        largest = np.sqrt([square.max(initial=0.0) for square in squares])
-        comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+        largest = maxima(comm, np.sqrt([square.max(initial=0.0) for square in squares]))
         return bcast_from_root(comm, float(largest.sum()))
 
     def _search(self, i: int, reach: float) -> ContactRecords:
@@ -262,14 +248,10 @@ class ContactSearch:
 
     def _from_origin(self, i: int, found: ContactRecords) -> ContactRecords:
         """Conditions of contact i with the gaps of the total displacement."""
-        if self._tools:  # at their places
-            found = replace(found, motion=self._tools.motion_there(found))
+        found = replace(found, motion=self._tools.motion_there(found))  # at their places
+        way = -found.motion
         if self._origin is not None:
             nodes, facets = self._origin
             here = facets if len(self.contacts[i].surfaces) > 1 else nodes
             way = relative_displacement(found, self._dofs, here)
-        elif self._tools:
-            way = -found.motion
-        else:
-            return found
         return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))

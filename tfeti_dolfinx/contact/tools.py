@@ -8,11 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, box_over_ranks
+from tfeti_dolfinx.common.parallel import bcast_from_root, box_over_ranks, maxima
 from tfeti_dolfinx.contact.partner import GEOMETRY, ContactPartner, Obstacle
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.rigid_body import MOTIONS, Pose, RigidBody, motion_fields
@@ -335,7 +334,7 @@ class Tools:
         """Raise if a rigid body begins inside of a surface. Collective."""
         overlap = np.zeros(max(len(contacts), 1))
         np.maximum.at(overlap, records.contact, -records.geometric_gap)
-        self._comm.Allreduce(MPI.IN_PLACE, overlap, op=MPI.MAX)
+        overlap = maxima(self._comm, overlap)
         for i in np.flatnonzero(self.of_contact >= 0):
             body = int(self.of_contact[i])
             if np.any(self.poses[body].motion):  # it is elsewhere already
@@ -355,8 +354,7 @@ class Tools:
         """
         wrong = np.zeros(len(self.of_contact))
         wrong[contact] = 1.0
-        self._comm.Allreduce(MPI.IN_PLACE, wrong, op=MPI.MAX)
-        if np.any(wrong):
+        if np.any(wrong := maxima(self._comm, wrong)):
             body = self.bodies[self.of_contact[int(np.argmax(wrong))]]
             raise InputError(
                 f"{body.name}: a rigid body with free motions meets nodes whose displacement along "

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import space_of
-from tfeti_dolfinx.common.parallel import box_over_ranks, summed
+from tfeti_dolfinx.common.parallel import box_over_ranks, maxima, summed
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs, is_same_space, space_in_words
@@ -100,9 +99,7 @@ class EndPlanes:
         most, least = (
             np.where(on, values, -np.inf).max(axis=0, initial=-np.inf) for values in (value, -value)
         )
-        found = np.array([free, there, most, least])
-        self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
-        free, there, most, least = found
+        free, there, most, least = maxima(self._comm, np.array([free, there, most, least]))
         alike = most + least <= agreement * np.maximum(np.abs(most), np.abs(least))
         planes = (free == 0.0) & (there > 0.0) & alike
         whole[self._groups] = np.any(on & planes, axis=1)

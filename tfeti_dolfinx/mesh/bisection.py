@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import box_over_ranks, summed
+from tfeti_dolfinx.common.parallel import box_over_ranks, maxima, summed
 
 
 @dataclass(frozen=True)
@@ -75,20 +75,20 @@ def _halves(
 ) -> Halves:
     """Plan the halving of parts; targets: numbers of final parts in each, and in its left half."""
     (whole, left), gdim = targets, grid.shape[1]
-    box = np.full((2, len(whole), gdim), np.iinfo(np.int64).max)  # of x and of -x
+    box = np.full((2, len(whole), gdim), np.iinfo(np.int64).min)  # of x and of -x
     for axis, column in enumerate(grid.T):
-        np.minimum.at(box[0, :, axis], part, column)
-        np.minimum.at(box[1, :, axis], part, -column)
-    comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
+        np.maximum.at(box[0, :, axis], part, column)
+        np.maximum.at(box[1, :, axis], part, -column)
+    box = maxima(comm, box)
     count, gap = sizes_of(part, len(whole), comm), None
-    axes = (np.argmax(-box[1] - box[0], axis=1)[:, None] + np.arange(gdim)) % gdim
+    axes = (np.argmax(box[0] + box[1], axis=1)[:, None] + np.arange(gdim)) % gdim
     if sizes is not None:
         largest = np.maximum(sizes.max(axis=1, initial=1)[:, None], 1)
         is_flat = np.any(PARAMETERS.flat * sizes <= largest, axis=1)
         total = np.zeros((2, len(whole), gdim), dtype=np.int64)
         np.add.at(total[0], part, sizes)
         np.add.at(total[1], part, (sizes << 10) // largest)
-        comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        total = summed(comm, total)
         flat = sizes_of(part[is_flat], len(whole), comm) > 0
         if gdim == 3:  # of two ties the thinner axis is the last to be cut across
             thick = np.take_along_axis(total[1], axes, axis=1)
@@ -150,7 +150,7 @@ def _end_of_layer(
         beyond = c < (end - same)[part]
         following = np.full(len(at), np.iinfo(np.int64).min)
         np.maximum.at(following, part[beyond], c[beyond])
-        comm.Allreduce(MPI.IN_PLACE, following, op=MPI.MAX)
+        following = maxima(comm, following)
         found |= following < end - gap
         end = np.where(found, end, following)
         if np.all(found):

@@ -97,10 +97,24 @@ class Facets:
     def __len__(self) -> int:
         return len(self.x)
 
-    def sent(self, exchange: Exchange, rows: Array | None = None) -> Facets:
-        """Return the facets (or some rows of them) that an exchange brings here. Collective."""
-        chosen = slice(None) if rows is None else rows
-        return Facets(*(exchange.send(getattr(self, f.name)[chosen]) for f in fields(self)))
+    def __getitem__(self, rows: Array) -> Facets:
+        return Facets(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def sent(self, exchange: Exchange) -> Facets:
+        """Return the facets that an exchange brings here. Collective."""
+        return Facets(*(exchange.send(getattr(self, f.name)) for f in fields(self)))
+
+    def at_vertices(self, dofs: TornDofs, table: Array) -> Array:
+        """Rows of the owned groups at the vertices, ``(g, ...)`` to ``(n, v, ...)``. Collective."""
+        (found,) = dofs.lookup(self.vertices.ravel(), table)
+        return found.reshape(*self.vertices.shape, *table.shape[1:])
+
+    def on_groups(
+        self, dofs: TornDofs, values: Array, op: np.ufunc = np.add, initial: Any = 0
+    ) -> Array:
+        """Combine values at the vertices, ``(n, v, ...)`` to ``(g, ...)``. Collective."""
+        values = values.reshape(-1, *values.shape[2:])
+        return dofs.reduce_on_owners(self.vertices.ravel(), values, op, initial)
 
     @property
     def corners(self) -> Array:
@@ -172,13 +186,10 @@ def local_facets(
     )
     if across is None:
         return found
-    (at,) = dofs.lookup(found.vertices.ravel(), across)
-    at = np.all(at.reshape(*found.vertices.shape, dofs.bs), axis=1)
+    at = found.at_vertices(dofs, across).all(axis=1)
     # others reach from one plane to another, in a slab of one cell
     kept = ~np.any(at & (np.abs(found.normal) > 1.0 - SEARCH.held), axis=1)
-    if not any_rank(dofs.comm, kept):
-        return found
-    return Facets(*(getattr(found, f.name)[kept] for f in fields(found)))
+    return found[kept] if any_rank(dofs.comm, kept) else found
 
 
 def with_averaged_normals(
@@ -191,12 +202,10 @@ def with_averaged_normals(
     gdim)``, and its ``edges_at_rest``.
     """
     rest = normals_at_rest(facets, dofs)
-    groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
-    averaged = unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
+    averaged = unit(facets.on_groups(dofs, facets.vertex_normals * facets.area[:, None, None]))
     if across is not None:
         averaged = unit(np.where(across & ~_edges(facets, rest[1], dofs, across), 0.0, averaged))
-    (at_vertices,) = dofs.lookup(groups, averaged)
-    turned = replace(facets, vertex_normals=at_vertices.reshape(weighted.shape))
+    turned = replace(facets, vertex_normals=facets.at_vertices(dofs, averaged))
     return turned, averaged, edges_at_rest(facets, rest, dofs, across)
 
 
@@ -207,25 +216,23 @@ def _edges(facets: Facets, averaged: Array, dofs: TornDofs, across: Array) -> Ar
     the plane. An edge that begins or ends with an iterate would turn normals, which Newton's method
     does not follow.
     """
-    groups, corners = facets.vertices.ravel(), facets.corners
-    (turned,) = dofs.lookup(groups, np.where(across, 0.0, np.abs(averaged)))
-    most = turned.reshape(corners.shape).max(axis=1, keepdims=True)
-    turned = np.broadcast_to(most, corners.shape).reshape(turned.shape)
-    turned = dofs.reduce_on_owners(groups, turned, np.maximum)
+    turned = facets.at_vertices(dofs, np.where(across, 0.0, np.abs(averaged)))
+    turned[:] = turned.max(axis=1, keepdims=True)
+    turned = facets.on_groups(dofs, turned, np.maximum)
     return np.abs(averaged) > np.maximum(turned / SEARCH.bends, SEARCH.held)
 
 
 def normals_at_rest(facets: Facets, dofs: TornDofs) -> tuple[Array, Array]:
     """Return normals of facets as they were meshed, and their means at owned groups. Collective."""
-    groups, normal, corners = facets.vertices.ravel(), facets.normal, facets.corners
+    normal, corners = facets.normal, facets.corners
     if dofs.nodes is not None:
         hats = facet_kind(dofs).hats
-        (rest,) = dofs.lookup(groups, dofs.reduce(dofs.points(at_rest=True), np.minimum))
-        places = corners, rest[:, : dofs.bs].reshape(corners.shape)
+        rest = facets.at_vertices(dofs, dofs.reduce(dofs.points(at_rest=True), np.minimum))
+        places = corners, rest[:, :, : dofs.bs]
         here, there = (_normals(hats, x, hats.points.mean(axis=0)[None])[0] for x in places)
         normal = unit(there * np.sign(np.sum(here * normal, axis=1, keepdims=True)))
-    repeated = np.repeat(normal, corners.shape[1], axis=0)
-    return normal, unit(dofs.reduce_on_owners(groups, repeated))
+    at_vertices = np.broadcast_to(normal[:, None], corners.shape)
+    return normal, unit(facets.on_groups(dofs, at_vertices))
 
 
 def edges_at_rest(
@@ -235,14 +242,12 @@ def edges_at_rest(
 
     On planes of symmetry it is edges that cross them.
     """
-    groups, (facet, averaged) = facets.vertices.ravel(), rest
-    own = np.repeat(facet, facets.vertices.shape[1], axis=0)
-    (averaged,) = dofs.lookup(groups, averaged)
+    own, averaged = rest[0][:, None], facets.at_vertices(dofs, rest[1])
     if across is not None:
-        (at,) = dofs.lookup(groups, across)
+        at = facets.at_vertices(dofs, across)
         own, averaged = (unit(np.where(at, 0.0, normal)) for normal in (own, averaged))
-    cosine = np.sum(own * averaged, axis=1)
-    return dofs.reduce_on_owners(groups, cosine, np.minimum, 1.0) < SEARCH.edge
+    cosine = np.sum(own * averaged, axis=2)
+    return facets.on_groups(dofs, cosine, np.minimum, 1.0) < SEARCH.edge
 
 
 def apart_at_edges(facets: Facets, dofs: TornDofs, edges: Array) -> Facets:
@@ -250,10 +255,10 @@ def apart_at_edges(facets: Facets, dofs: TornDofs, edges: Array) -> Facets:
 
     A mean is of no side there.
     """
-    (at,) = dofs.lookup(facets.vertices.ravel(), edges)
-    at = at.reshape(*facets.vertices.shape, 1)
-    normals = np.where(at, facets.normal[:, None], facets.vertex_normals)
-    return replace(facets, vertex_normals=normals)
+    at = facets.at_vertices(dofs, edges)[:, :, None]
+    return replace(
+        facets, vertex_normals=np.where(at, facets.normal[:, None], facets.vertex_normals)
+    )
 
 
 def shares_at_edges(
@@ -296,16 +301,14 @@ def with_images(facets: Facets, dofs: TornDofs, across: Array | None) -> Facets:
     """
     if across is None:
         return facets
-    (at,) = dofs.lookup(facets.vertices.ravel(), across)
-    at = at.reshape(*facets.vertices.shape, dofs.bs)
+    at = facets.at_vertices(dofs, across)
     for k in range(dofs.bs):
         of = np.flatnonzero(at[:, :, k].any(axis=1) & ~at[:, :, k].all(axis=1))
         if not len(of):
             continue
         sign = np.where(np.arange(dofs.bs) == k, -1.0, 1.0)
         offset = 2.0 * facets.x[of, np.argmax(at[of, :, k], axis=1), k]
-        image = Facets(*(getattr(facets, f.name)[of] for f in fields(facets)))
-        x = sign * image.x
+        image, x = facets[of], sign * facets.x[of]
         x[:, :, k] += offset[:, None]
         image = replace(
             image,

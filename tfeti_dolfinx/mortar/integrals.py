@@ -37,7 +37,7 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind, across: Arra
     ``across`` of owned groups' components, have mirrored neighbours, too. Facets whose geometry has
     a higher degree are curved themselves, and stay as they are.
     """
-    normals, groups = facets.vertex_normals, facets.vertices.ravel()
+    normals = facets.vertex_normals
     cosine = np.einsum("nvg,ng->nv", normals, facets.normal)
     turns = bool(np.any(cosine < 1.0 - SEARCH.turned))
     if kind.geometry.degree > 1 or not any_rank(dofs.comm, turns):
@@ -46,10 +46,9 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind, across: Arra
     axes = tangents(normals.reshape(-1, gdim)).reshape(n, v, gdim - 1, gdim)
     M, b = _normal_equations(facets.corners, normals, axes)
     if across is not None:
-        (at,) = dofs.lookup(groups, across)
-        M, b = _mirrored(M, b, axes, at.reshape(n, v, gdim))
+        M, b = _mirrored(M, b, axes, facets.at_vertices(dofs, across))
     sharp = (cosine <= SEARCH.edge).astype(float)
-    exchange, asked = dofs.owners_of(groups)
+    exchange, asked = dofs.owners_of(facets.vertices.ravel())
     vertex, place = np.unique(asked, return_inverse=True)
     M, b, sharp = (
         sum_rows(place, exchange.send(part.reshape(n * v, *part.shape[2:])), len(vertex))

@@ -120,19 +120,13 @@ def facet_multipliers(
 # --- Vertices that conditions hold ------------------------------------------------------------
 
 
-def with_held_vertices(
-    facets: Facets, dofs: TornDofs, normals: Array, flag: Array | None
-) -> Facets:
+def with_held_vertices(facets: Facets, dofs: TornDofs, normals: Array, flag: Array) -> Facets:
     """Return the same facets with flags of vertices that Dirichlet conditions hold. Collective.
 
-    Normals and flags of prescribed components are those of owned groups, shape ``(g, gdim)``; None:
-    nothing is prescribed.
+    Normals and flags of prescribed components are those of owned groups, shape ``(g, gdim)``.
     """
-    if flag is None:
-        return facets
     fixed = np.all(flag | (np.abs(normals) <= SEARCH.held), axis=1)
-    (held,) = dofs.lookup(facets.vertices.ravel(), fixed)
-    return replace(facets, held=held.reshape(facets.vertices.shape))
+    return replace(facets, held=facets.at_vertices(dofs, fixed))
 
 
 def near_held(kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments) -> Array:

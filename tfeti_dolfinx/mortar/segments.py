@@ -95,7 +95,7 @@ def rendezvous(
     near = np.flatnonzero(np.all((reach[0] <= boxes[:, 1]) & (reach[1] >= boxes[:, 0]), axis=1))
     meets = (low[:, None] <= boxes[near, 1]) & (high[:, None] >= boxes[near, 0])
     facet, place = np.nonzero(np.all(meets, axis=2))
-    return here, primary.sent(Exchange(comm, near[place]), facet)
+    return here, primary[facet].sent(Exchange(comm, near[place]))
 
 
 def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple[Array, Array]:
@@ -255,9 +255,8 @@ def met_at_edges(
     corner = edge & (np.linalg.norm(faced := sums[:, :-1], axis=1) < SEARCH.edge * total)
     faced = unit(faced if across is None else np.where(across, 0.0, faced))
     normals = np.where(edge[:, None] & np.any(faced != 0.0, axis=1, keepdims=True), faced, normals)
-    (turned,) = dofs.lookup(vertices.ravel(), normals)
-    turned = turned.reshape(secondary.corners.shape)
-    return normals, corner, replace(secondary, vertex_normals=turned), segments
+    turned = replace(secondary, vertex_normals=secondary.at_vertices(dofs, normals))
+    return normals, corner, turned, segments
 
 
 @dataclass(frozen=True)
@@ -321,7 +320,7 @@ class _Planes:
     def first_layer(self, found: _Meetings) -> Array:
         """Return the pairs with no other primary facet before theirs."""
         covered = np.bincount(found.s, found.parts.size, minlength=len(self.size))
-        twice = covered > (1.0 + SEARCH.covered_twice) * self.size
+        twice = covered > (1.0 + SEARCH.uncovered) * self.size
         several = np.flatnonzero(twice[found.s])
         a, there = self._over(found, several, several)
         first = np.ones(len(found.s), dtype=bool)

@@ -51,14 +51,13 @@ class SearchTolerances:
     # that what is held may lack
     held: float = 1e-6
     same_layer: float = 1e-9  # distances closer than this are those of facets of one layer
-    covered_twice: float = 1e-6  # common parts that exceed a facet by less are one layer
     # cosine, of about 92°: facets seen from the side have only slivers in common
     facing: float = -0.03
     # quadrilaterals that are farther from parallelograms have rational hats
     parallel: float = 1e-10
     rational_degree: int = 12  # degree of quadrature for those; none is exact
     curved_degree: int = 2  # degrees more on curved facets, where areas are no polynomials
-    uncovered: float = 1e-6  # share of a facet that rounding may leave uncovered
+    uncovered: float = 1e-6  # share of a facet that rounding may leave uncovered, or cover twice
     # of the square (in 2D: the length) of a facet's radius: smaller areas are rounding, and the
     # facet has no normal
     degenerate: float = 1e-12

@@ -152,7 +152,7 @@ class Predictor:
         w is in DOLFINx's order, as is this rank's mass M, whose factors are kept while it is the
         same object; right sides of the rows are as before afterwards.
         """
-        bodies = tools.of_mass_alone() if tools.num_unknowns else None
+        bodies = tools.of_mass_alone() if tools.num_unknowns else tools
         dofs, settings, constraints = self._dofs, self._settings, gluing.constraints
         before, f = np.array(constraints.c), M @ w
         values = mean_of_copies(dofs, dofs.to_primal(w)).ravel()
@@ -163,10 +163,10 @@ class Predictor:
                 self.destroy()
                 data = subdomain_data(dofs, M, f, constraints.trace)
                 equals = EqualSubdomains(settings.inverse_factory())
-                self._subdomains = settings.make_subdomains(data, dofs, equals, tools=bodies)
+                self._subdomains = settings.make_subdomains(data, dofs, equals, bodies)
                 self._M = M
             assert self._subdomains is not None
-            own = bodies.load[: bodies.num_local] if bodies else np.zeros(0)
+            own = bodies.load[: bodies.num_local]
             self._subdomains.update(f=np.append(dofs.to_primal(f), own))
             if self._dual is not None and self._dual.constraints is constraints:
                 self._dual.update_load()
@@ -195,7 +195,7 @@ class Predictor:
             self.multiplications = dual.F.count
             conclude(result, accuracy, options, dofs.comm)
             nodal = self._subdomains.num_nodal
-            if bodies:
+            if tools.num_unknowns:
                 bodies.take(accuracy.u[nodal:])
                 tools.drift = bodies.way()
             return dofs.to_dolfinx(accuracy.u[:nodal])
