@@ -91,10 +91,14 @@ LIMITS = WarningLimits()
 
 
 class Diagnostics:
-    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again."""
+    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
+
+    ``may_lock``: displacements have degree 1, and the law is not selective.
+    """
 
     def __init__(self, dofs: TornDofs) -> None:
         self._decomposition, self._dofs = dofs.decomposition, dofs
+        self.may_lock = dofs.V.element.basix_element.degree == 1
         self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
         self._slopes: list[Array] = []
@@ -161,7 +165,7 @@ class Diagnostics:
 
     def _locking(self, subdomains: Subdomains, nodes: Sequence[Array]) -> Iterator[str]:
         """Displacements of degree 1 where a material hardly changes its volume."""
-        if self._dofs.V.element.basix_element.degree > 1:
+        if not self.may_lock:
             return
         ratios = [
             block.stiffness.stretch_over_shear

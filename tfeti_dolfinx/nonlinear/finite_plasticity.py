@@ -96,7 +96,7 @@ class FiniteJ2Plasticity(Plasticity):
         P, dP = point.P, point.tangent(self._entries)
         P[out] = dP[out] = np.nan
         dilatation = np.log(np.linalg.det(F))
-        if self._selective:  # that of the centre of the cell, nearly
+        if self.selective:  # that of the centre of the cell, nearly
             cells = dilatation.reshape(-1, self._points)
             dilatation = np.repeat(cells.mean(axis=1), self._points)
         self._more.x.array[own] = point.missing(self._values_of(self._kappa), dilatation)

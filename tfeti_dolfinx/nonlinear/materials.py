@@ -116,6 +116,7 @@ class Material(ABC):
         elasticity: The elastic law.
         u: The displacement.
         volumes: Tags of the volumes; None: all.
+        selective: Whether what resists a change of volume is integrated at centres of cells.
         dx: The measure of their cells.
         state: Internal variables with their values at the end of a load step.
     """
@@ -160,7 +161,7 @@ class Material(ABC):
             self._inside.x.array[self._rows_of(self._inside)] = 1.0
         own, cell = u.function_space.element.basix_element.degree, mesh.basix_cell()
         simplex = cell in (basix.CellType.triangle, basix.CellType.tetrahedron)
-        self._selective = checked_flag(selective, "selective")
+        self.selective = checked_flag(selective, "selective")
         if selective and (simplex or own != 1):
             raise InputError(
                 f"selective=True on {cell.name}s with displacements of degree {own}; expected "
@@ -181,7 +182,7 @@ class Material(ABC):
 
     def update(self) -> None:
         """Take ``u`` as it is now. Collective."""
-        if not self._selective:
+        if not self.selective:
             return
         if self._centred is None:
             W = fem.functionspace(self.elasticity.mesh, ("DG", 0, (3, 3)))

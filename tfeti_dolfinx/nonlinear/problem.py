@@ -165,6 +165,7 @@ class NonlinearContactProblem(ContactProblem):
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact = self.options.number
+        self._diagnostics.may_lock &= not laws or not all(law.selective for law in laws)
         self._system.is_tangent = True
         self._begin = self._first
         self._system.begin_at(self.dofs.to_primal(self._begin))
