@@ -34,9 +34,8 @@ class Scene:
         bcs = [clamp(dofs.V, d.facets("left"), np.arange(1.0, gdim + 1))] if clamped else []
         none = prescribe(dofs, [])
         found = [c.records(dofs, i, np.inf, np.inf, none) for i, c in enumerate(contacts)]
-        records = concatenate(found, gdim)
         self.weights = np.ones(dofs.num_nodes * dofs.bs) if weights is None else weights(dofs)
-        self.gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, self.weights)
+        self.gluing = glue(dofs, prescribe(dofs, bcs), concatenate(found, gdim), 1.0, self.weights)
         self.constraints = self.gluing.constraints
 
     @property
