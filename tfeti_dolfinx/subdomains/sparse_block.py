@@ -220,18 +220,22 @@ def stretch_over_shear(x: Array, bs: int, multiply: Callable[[Array], Array]) ->
 
     On a subdomain, which is free, uᵀKu of a stretch along an axis is the volume times λ + 2μ, and
     that of a shear along it the volume times μ. The smallest ratio over the axes, but for the
-    radius of an axisymmetric model, along which nothing is free; 0 where unknowns are no
+    radius x[0] of an axisymmetric model, along which nothing is free; 0 where unknowns are no
     displacements.
     """
     if bs != x.shape[1] or bs == 1 or len(x) == 0:
         return 0.0
-    x, ratios = x - x.mean(axis=0), list[tuple[bool, float]]()
-    for i in range(bs):
-        ways = np.zeros((3, *x.shape))  # a stretch, a shear and a motion
-        ways[0, :, i], ways[1, :, i], ways[2, :, i] = x[:, i], x[:, (i + 1) % bs], np.ptp(x)
-        along, across, moved = (float(u @ multiply(u)) for u in ways.reshape(3, -1))
-        ratios.append((moved > across, along / max(across, TINY)))
-    return min(ratios)[1]
+    x = x - x.mean(axis=0)
+
+    def energy(axis: int, values: Array) -> float:
+        u = np.zeros_like(x)
+        u[:, axis] = values
+        return float(u.ravel() @ multiply(u.ravel()))
+
+    along = [energy(i, x[:, i]) for i in range(bs)]
+    across = [max(energy(i, x[:, (i + 1) % bs]), TINY) for i in range(bs)]
+    is_radius = energy(0, np.full(len(x), np.ptp(x))) > across[0]
+    return min(a / b for a, b in list(zip(along, across, strict=True))[is_radius:])
 
 
 # --- Equal subdomains -------------------------------------------------------------------------
