@@ -175,8 +175,7 @@ def test_curved_bodies_of_first_and_second_order(comm, order, tolerance, hexahed
     dx, ds = measures(d)
     assert integral(1 * dx(d.volume("body"))) == pytest.approx(0.75 * np.pi / 4, rel=tolerance)
     assert integral(1 * ds(d.surface("mantle"))) == pytest.approx(np.pi / 2, rel=tolerance)
-    expected = "hexahedron" if hexahedra else "tetrahedron"
-    assert d.mesh.topology.cell_type.name == expected
+    assert d.mesh.topology.cell_type.name == ("hexahedron" if hexahedra else "tetrahedron")
 
 
 def write(folder, version=4.1, ghosts=False, partition=5):

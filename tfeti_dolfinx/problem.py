@@ -532,7 +532,7 @@ class ContactProblem:
         system.tools.go_back(state.tools)  # by now laws may have others
         system.make(self._seconds)
         dual = system.dual
-        dual.norm, dual.law_target = max(dual.norm, float(state.norm)), tuple(state.left)
+        dual.norm, dual.law_target = max(dual.norm, float(state.norm)), tuple(state.law_target)
         state = state.on_rows(system.gluing)
         # what conditions prescribed then: by now they may have other values
         values = self.dofs.reduce(state.u.reshape(-1, self.dofs.bs), np.maximum)

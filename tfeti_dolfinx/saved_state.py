@@ -144,7 +144,7 @@ class SavedState:
     lam: Array  # multipliers λ of this rank's rows
     mu: Array  # multipliers of Gλ = e; empty where they are not known
     norm: Array  # estimate of ‖F‖ that solves have come to, shape ()
-    left: Array  # `Dual.law_target`: what solves with Coulomb's law leave of residuals, shape (2,)
+    law_target: Array  # what solves with Coulomb's law leave of residuals, as `Dual` has it, (2,)
     status: Array  # status of each row, see `qp.sets.Status`
     slip: Array  # where the load step began: tangential v_i of the conditions, (n, gdim - 1)
     reach: Array  # how far was searched in each contact
@@ -196,7 +196,7 @@ class SavedState:
             lam=solution.lam,
             mu=mu,
             norm=np.array(dual.norm),
-            left=np.array(dual.law_target),
+            law_target=np.array(dual.law_target),
             status=np.where(solution.carrying, bearing, Status.OPEN),
             slip=gluing.slip,
             reach=np.array(reach, dtype=float),
@@ -291,7 +291,7 @@ class SavedState:
             "secondary": self.secondary.tolist(),
             "size": float(self.size),
             "norm": float(self.norm),
-            "left": self.left.tolist(),
+            "law_target": self.law_target.tolist(),
             "freezes": bool(self.freezes),
             "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
             "number of directions": self.directions.shape[2],

@@ -10,7 +10,7 @@ from dolfinx import fem, geometry
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import EPSILON, Array, quotient, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, largest, maxima, summed
-from tfeti_dolfinx.common.validation import named, real_numbers
+from tfeti_dolfinx.common.validation import real_numbers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -142,8 +142,12 @@ class Solution:
         mesh, u = self.decomposition.mesh, self.displacement
         with agreeing(self.dofs.comm, "at") as given:
             gdim = mesh.geometry.dim
-            with named("points", TypeError, ValueError):
+            try:
                 points = real_numbers(points)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"points: {error}; expected numbers of shape (k, {gdim})"
+                ) from error
             if points.ndim != 2 or points.shape[1] != gdim or not np.all(np.isfinite(points)):
                 raise InputError(
                     f"points of shape {points.shape}; expected finite numbers of shape (k, {gdim})"

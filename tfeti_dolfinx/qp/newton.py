@@ -265,10 +265,10 @@ class NewtonIteration:
         if chopped > self.parameters.gamma**2 * free:
             moved = self.feasible.project(z.lam - beta / self.norm)
             face = self.feasible.face(0.5 * (z.lam + moved), self.s)
-        pressed = self.face_hat.status
-        early = (face.status == Status.STICK) & (pressed == Status.SLIP)
+        hat = self.face_hat.status
+        early = (face.status == Status.STICK) & (hat == Status.SLIP)
         if any_rank(self.qp.coarse.comm, face.status >= RUBS):
-            early |= (face.status == Status.TOUCHING) & (pressed == Status.OPEN)
+            early |= (face.status == Status.TOUCHING) & (hat == Status.OPEN)
         if not any_rank(self.qp.coarse.comm, early):
             return z, face
         self.resume = False

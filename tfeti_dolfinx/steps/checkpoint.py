@@ -22,7 +22,7 @@ from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table, numbered
 
-INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 9
+INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 10
 KIND = "checkpoint of tfeti_dolfinx"
 COUNTS = " of subdomains"  # behind the name of an array: how many of its rows are of each
 _hash: Any = functools.partial(hashlib.blake2b, digest_size=16)
