@@ -177,7 +177,7 @@ class Diagnostics:
         if np.any(worst > LIMITS.locks):
             t = float(worst.max())
             yield (
-                f"{self._names(worst > LIMITS.locks)}: Poisson's ratio is about "
+                f"{self._names(worst > LIMITS.locks)}: Poisson's ratio of its stiffness is about "
                 f"{(t - 2.0) / (2.0 * t - 2.0):.4g} and displacements have degree 1, which makes "
                 "it too stiff (locking) unless its law is selective; expected degree 2"
             )
