@@ -25,7 +25,7 @@ DEMOS = (
 )
 LARGE = {
     "rubber_pressed_3d": ["--size", "0.0158", "--subdomains", "200"],
-    "plastic_hertz_3d": ["--size", "0.0058", "--subdomains", "50"],
+    "plastic_hertz_3d": ["--size", "0.0058", "--subdomains", "50", "--degree", "1"],
 }
 # of a step's figures: the columns of their means
 COUNTS = {

@@ -1,7 +1,7 @@
 """Diagnostics of a solution: the warnings of the report."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import ref
@@ -93,14 +93,17 @@ LIMITS = WarningLimits()
 class Diagnostics:
     """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
 
-    ``may_lock``: displacements have degree 1, and the law is not selective.
+    ``may_lock``: displacements have degree 1, and the law is not selective; ``flowing``: from laws,
+    the cells of this rank in which plastic flow is most of the strain.
     """
 
     def __init__(self, dofs: TornDofs) -> None:
         self._decomposition, self._dofs = dofs.decomposition, dofs
         self.may_lock = dofs.V.element.basix_element.degree == 1
+        self.flowing: list[Callable[[], Array]] = []
         self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
+        self._locks = np.zeros(0, dtype=bool)  # which bodies lock whatever flows
         self._slopes: list[Array] = []
 
     def found(
@@ -124,6 +127,7 @@ class Diagnostics:
             *self._facets(solution, dual.subdomains),
             *_corners(solution),
             *self._lasting,
+            *self._flow(),
             *of_estimates(outcome),
         ]
 
@@ -174,12 +178,27 @@ class Diagnostics:
             for block, x in zip(subdomains.elastic, nodes, strict=True)
         ]
         worst = subdomains.of_bodies([ratios], largest=True)[0]
-        if np.any(worst > LIMITS.locks):
+        self._locks = worst > LIMITS.locks
+        if np.any(self._locks):
             t = float(worst.max())
             yield (
-                f"{self._names(worst > LIMITS.locks)}: Poisson's ratio of its stiffness is about "
+                f"{self._names(self._locks)}: Poisson's ratio of its stiffness is about "
                 f"{(t - 2.0) / (2.0 * t - 2.0):.4g} and displacements have degree 1, which makes "
                 "it too stiff (locking) unless its law is selective; expected degree 2"
+            )
+
+    def _flow(self) -> Iterator[str]:
+        """Displacements of degree 1 where plastic flow keeps the volume."""
+        if not (self.may_lock and self.flowing):
+            return
+        d, cells = self._decomposition, np.concatenate([cells() for cells in self.flowing])
+        own = np.zeros(d.num_bodies)
+        own[d.body_of_subdomain[d.cell_subdomain[cells]]] = 1.0
+        if np.any(flows := maxima(d.comm, own) > self._locks[: d.num_bodies]):
+            yield (
+                f"{self._names(flows)}: plastic flow keeps the volume, and displacements have "
+                "degree 1, which makes it too stiff (locking); expected degree 2, or selective=True"
+                " on quadrilaterals or hexahedra"
             )
 
     def _rounding(self, dual: Dual, u: Array, energy: Array, rtol: float) -> Iterator[str]:

@@ -72,6 +72,9 @@ class FiniteJ2Plasticity(Plasticity):
         self._new = (np.array(self.inverse_plastic.x.array), np.array(self.p.x.array))
         self.state = {self.inverse_plastic: lambda: self._new[0], self.p: lambda: self._new[1]}
 
+    def _accumulated(self) -> Array:
+        return self._new[1]
+
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective.
 

@@ -49,6 +49,10 @@ class ReturnTolerances:
     # share of the shear modulus that a tangent of finite strain keeps on all that stretches:
     # stresses near the moduli, as a trial displacement may have, take from it
     definite: float = 1e-3
+    # plastic strain over that of yielding, σ_y/3μ, from which on flow is most of the strain: of ν =
+    # 0.3 it leaves as little stiffness against shear, beside that against a change of volume, as
+    # ν = 0.474 has
+    flows: float = 8.0
 
 
 # what hardening is given by, and its ranges
@@ -304,12 +308,26 @@ class Plasticity(Material):
             name: value if isinstance(value, fem.Constant) else fem.Expression(value, points)
             for name, value in self.given.items()
         }
+        of_yielding = self.given["yield_stress"] / (3 * elasticity.mu)
+        self._strain_of_yielding = fem.Expression(of_yielding, points)
         self._begin()
         self.update()
 
     @abstractmethod
     def _begin(self) -> None:
         """Make functions and expressions at the quadrature points."""
+
+    @abstractmethod
+    def _accumulated(self) -> Array:
+        """Return p at the end of the load step, at all quadrature points."""
+
+    def flowing(self) -> Array:
+        """Return this rank's cells in which plastic flow is most of the strain. Collective."""
+        far = self._tolerances.flows * self._values_of(self._strain_of_yielding)
+        flows = np.zeros(len(self._value.x.array), dtype=bool)
+        flows[self._rows] = self._accumulated()[self._rows] > far
+        cells = np.asarray(self._value.function_space.dofmap.list)
+        return np.flatnonzero(np.any(flows[cells], axis=1))
 
     def hardening(self) -> IsotropicHardening:
         """Return yield stress and hardening with their values at its quadrature points. Collective.
@@ -387,6 +405,9 @@ class J2Plasticity(Plasticity):
         places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
         components = [new[i, j] for i, j in places[: 6 if self._gdim == 3 else 4]]
         self.state = {self.plastic_strain: ufl.as_vector(components), self.p: self.p + self._dp}
+
+    def _accumulated(self) -> Array:
+        return np.asarray(self.p.x.array + self._dp.x.array)
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""

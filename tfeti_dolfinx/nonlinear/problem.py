@@ -32,7 +32,7 @@ from tfeti_dolfinx.errors import (
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms, rotation_free_tangent
-from tfeti_dolfinx.nonlinear.materials import derivative_of, laws_of
+from tfeti_dolfinx.nonlinear.materials import Plasticity, derivative_of, laws_of
 from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonTolerances
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.problem import ContactProblem
@@ -165,7 +165,9 @@ class NonlinearContactProblem(ContactProblem):
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact = self.options.number
-        self._diagnostics.may_lock &= not laws or not all(law.selective for law in laws)
+        locking = [law for law in laws if not law.selective]
+        self._diagnostics.may_lock &= not laws or bool(locking)
+        self._diagnostics.flowing = [law.flowing for law in locking if isinstance(law, Plasticity)]
         self._system.is_tangent = True
         self._begin = self._first
         self._system.begin_at(self.dofs.to_primal(self._begin))
