@@ -8,7 +8,7 @@ import pytest
 from quick_demos import alone, process
 
 from tfeti_dolfinx.common.logging import PAPERS, entry
-from tfeti_dolfinx.qp.solvers import SOLVERS
+from tfeti_dolfinx.options import SOLVERS
 
 ROOT = Path(__file__).resolve().parents[1]
 

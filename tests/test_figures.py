@@ -13,7 +13,7 @@ from test_docs import DOCUMENTS, ROOT, USER_PAGES, prose
 import demos
 import tfeti_dolfinx as tfeti
 from benchmarks.stability_scenes import MODULI, UNITS
-from tfeti_dolfinx.accuracy.diagnostics import WarningLimits
+from tfeti_dolfinx.accuracy import WarningLimits
 from tfeti_dolfinx.bem.steklov import StiffnessTolerances
 from tfeti_dolfinx.feti.dual import DualLimits
 from tfeti_dolfinx.mesh.partition import UNKNOWNS

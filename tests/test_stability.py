@@ -14,7 +14,7 @@ import tfeti_dolfinx as tfeti
 from benchmarks import stability
 from benchmarks.stability_scenes import LADDERS, label
 from benchmarks.stress.judge import run_scene
-from tfeti_dolfinx.accuracy.diagnostics import flatness
+from tfeti_dolfinx.accuracy import flatness
 
 QUICK = ("stiff on soft", "loose stack", "cells", "P1", "layers at contact", "strips", "hinge")
 QUICK += ("two obstacles", "grazing", "frictionless", "Tresca, moduli", "Coulomb, nu")

@@ -1,10 +1,10 @@
-"""Options: one typed dataclass, its table, and what a command line says of it."""
+"""Options: all solvers, one typed dataclass, its table, and what a command line says of it."""
 
 import difflib
 import math
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import (
     FROM_0,
     FROM_1,
@@ -25,12 +26,55 @@ from tfeti_dolfinx.common.validation import (
 )
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
-from tfeti_dolfinx.qp.krylov import PcpgParameters
-from tfeti_dolfinx.qp.newton import NewtonParameters
-from tfeti_dolfinx.qp.smalse import SmalseParameters
-from tfeti_dolfinx.qp.solvers import SOLVERS
+from tfeti_dolfinx.qp.krylov import PcpgParameters, solve_by_pcpg
+from tfeti_dolfinx.qp.newton import NewtonParameters, feasible_start, first_point, newton
+from tfeti_dolfinx.qp.problem import QP, QPResult
+from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
 from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options
 from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
+
+# --- Solvers of the dual problem --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Solver:
+    """QP solver, with its requirements."""
+
+    # solves a program from a start, with a stopping rule and parameters, those of options with its
+    # name; by name `max_it` and `monitor`, as `newton` does
+    solve: Callable[..., QPResult]
+    keeps_sets: bool  # whether it keeps inequalities and friction
+    pc_type: str  # preconditioner that `auto` stands for
+    relative_to_norm: bool  # whether its steps are relative to ‖PFP‖
+    # where it starts, which is its λ̄; None: λ̄₀ = Gᵀ(GGᵀ)⁻¹e
+    cold: Callable[[QP], Array] | None = None
+    # from an earlier λ to λ̄; None: λ̄ is as without one
+    warm: Callable[[QP, Array], Array] | None = None
+
+
+SOLVERS = {
+    "pcpg": Solver(
+        solve_by_pcpg,
+        keeps_sets=False,
+        pc_type="auto",
+        relative_to_norm=False,
+        # the nearest solution of Gλ̄ = e: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ)
+        warm=lambda qp, lam: qp.coarse.project(lam) + qp.coarse.particular(),
+    ),
+    "smalse": Solver(smalse, keeps_sets=True, pc_type="none", relative_to_norm=True),
+    "newton": Solver(
+        newton,
+        keeps_sets=True,
+        pc_type="auto",
+        relative_to_norm=False,
+        cold=first_point,
+        warm=feasible_start,
+    ),
+}
+# what auto stands for, without and with inequalities
+AUTO = {False: "pcpg", True: "newton"}
+
+# --- Options ----------------------------------------------------------------------------------
 
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2

@@ -11,8 +11,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.accuracy.diagnostics import ESTIMATES, Diagnostics, notes_of, of_estimates
-from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of
+from tfeti_dolfinx.accuracy import Diagnostics, Estimates, estimate, goal_of, notes_of
 from tfeti_dolfinx.common.agreement import agreeing, as_json, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
@@ -369,10 +368,7 @@ class ContactProblem:
             FactorError: A matrix could not be factored.
         """
         self._meet("estimate")
-        found = estimate(self._system, self.solution, self._rounding)
-        self.report.estimates = {n: x for n, x in vars(found).items() if x is not None}
-        kept = [text for text in self.report.warnings if not text.startswith(ESTIMATES)]
-        self.report.warnings = [*kept, *of_estimates(self.report)]
+        found = estimate(self._system, self.solution, self._rounding, self.report)
         self._log_warnings()
         return found
 

@@ -240,7 +240,7 @@ class Accuracy(StoppingRule):
         measures: What the last look has seen, and ``allowed`` the tolerances of that.
         checks: All that the last look has compared, by name.
         estimates: With a goal the errors at the last look, and what they have cost at all looks, as
-            in ``Estimates`` of ``accuracy/estimates.py``.
+            in ``Estimates`` of ``accuracy.py``.
     """
 
     limits = StoppingTolerances()

@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError
 from tfeti_dolfinx.feti.dual import Dual, contact_set
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget, MakeRule
-from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.options import AUTO, SOLVERS, Options, Solver
 from tfeti_dolfinx.qp.coarse import imbalance
 from tfeti_dolfinx.qp.problem import (
     QP,
@@ -26,7 +26,6 @@ from tfeti_dolfinx.qp.problem import (
     printing,
 )
 from tfeti_dolfinx.qp.projection import UNBALANCED
-from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "

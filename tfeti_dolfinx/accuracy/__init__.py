@@ -1,1 +1,0 @@
-"""Estimates of errors, and warnings about answers that cannot be trusted."""
