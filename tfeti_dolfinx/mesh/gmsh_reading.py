@@ -1,8 +1,8 @@
 """Read gmsh files: cells, partitions and tags, split among ranks."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count, takewhile
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -55,18 +55,8 @@ def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> 
     with raised_on_all_ranks(comm):
         if comm.rank == 0 and isinstance(source, (str, PathLike)):
             path = Path(source)
-            parts = re.compile(re.escape(path.stem) + r"_([1-9]\d*)" + re.escape(path.suffix))
-            if not path.is_file() and path.parent.is_dir():
-                matches = (parts.fullmatch(entry.name) for entry in path.parent.iterdir())
-                numbers = {int(match[1]) for match in matches if match}
-                last = max(numbers, default=0)
-                files = [path.with_stem(f"{path.stem}_{k}") for k in range(1, last + 1)]
-                if len(files) > len(numbers):
-                    missing = min(set(range(1, len(files) + 1)) - numbers)
-                    raise InputError(
-                        f"{files[missing - 1]}: no such file, but {files[-1].name} is there; "
-                        f"expected either {path.name}, or one file for each partition from 1 on"
-                    )
+            parts = (path.parent / f"{path.stem}_{k}{path.suffix}" for k in count(1))
+            files = [] if path.is_file() else list(takewhile(Path.is_file, parts))
     return comm.bcast(files, root=0)
 
 
@@ -170,7 +160,7 @@ def untorn_mesh(
     all_x = np.concatenate([np.empty((0, 3)), *(content.x for content in with_cells)])
     node_ids, first = np.unique(all_ids, return_index=True)
     order = cell_permutation(cell_type, found.nodes.shape[1])
-    cells = places(node_ids, found.nodes[:, order])
+    cells = np.searchsorted(node_ids, found.nodes[:, order])
     mesh = UntornMesh(
         cell_type=cell_type,
         element=element,
@@ -193,21 +183,6 @@ def untorn_mesh(
         check_shared(mesh, all_ids, all_x, float(sides.max()), comm)
     partitioned = comm.allreduce(bool(np.all(found.partitions >= 0)), op=MPI.LAND)
     return mesh, found.partitions if partitioned else None
-
-
-def places(known: Array, ids: Array, wide: int = 4) -> Array:
-    """Return where ids stand among those known, which ascend and have them all.
-
-    Where most numbers in between are known, a table of them all says it; else a search, since the
-    table might be ``wide`` times as long as what this rank has, or more.
-    """
-    least = int(known[0]) if len(known) else 0
-    width = int(known[-1]) - least + 1 if len(known) else 0
-    if width > wide * len(known):
-        return np.searchsorted(known, ids)
-    table = np.zeros(width, dtype=np.int64)
-    table[known - least] = np.arange(len(known))
-    return table[ids - least]
 
 
 def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> str:

@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -22,7 +22,7 @@ from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table, numbered
 
-INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 10
+INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 11
 KIND = "checkpoint of tfeti_dolfinx"
 COUNTS = " of subdomains"  # behind the name of an array: how many of its rows are of each
 _hash: Any = functools.partial(hashlib.blake2b, digest_size=16)
@@ -38,11 +38,6 @@ class Index:
 
     number: int  # how many steps have converged; 0: the folder is taken, nothing is kept yet
     ranks: int  # the largest number of ranks that have written here
-    states: list[str] = field(default_factory=list)  # checksum of the state's file of each rank
-    # subdomains of each rank, which its file has
-    subdomains: list[list[int]] = field(default_factory=list)
-    digest: Any = ""  # describes what the user has given, see `Checkpoint.write`
-    about: dict[str, Any] = field(default_factory=dict)  # what else is kept
     kind: str = KIND  # the mark of a folder that a checkpoint owns
     version: int = VERSION  # of this form
 
@@ -65,13 +60,14 @@ class Index:
 
 @dataclass(frozen=True)
 class Kept:
-    """Content of a checkpoint of a series, the same on all ranks."""
+    """What is kept of a step: a line of ``records.jsonl``, the same on all ranks."""
 
-    index: Index  # the step that counts
-    records: list[dict[str, Any]]  # the record of each step
-    # checksums of the fields' files of all ranks, of each step; empty where none are
-    fields: list[list[str]]
-    subdomains: list[list[list[int]]]  # the subdomains that each of them has
+    record: dict[str, Any]  # its record
+    digest: Any  # describes what the user has given
+    about: dict[str, Any]  # what else is to be known of it
+    states: list[str]  # checksum of the state's file of each rank
+    fields: list[str]  # of the fields' likewise; empty where none are
+    subdomains: list[list[int]]  # subdomains of each rank, which its files have
 
 
 class Checkpoint:
@@ -80,9 +76,9 @@ class Checkpoint:
     Each rank writes its arrays to a file of its own, with the number of the step in its name,
     subdomain by subdomain. Another number of ranks reads them: each rank the files that have its
     subdomains. The record of the step is a line at the end of ``records.jsonl``, with the checksums
-    of its fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of
-    states: it is written aside and renamed, so it names whole files at any time, and a line that is
-    torn lies beyond the lines of so many steps. Then the state of the step before goes. What a step
+    of these files. When all are whole, ``checkpoint.json`` takes that number: it is written aside
+    and renamed, so it names whole files at any time, and a line that is torn lies beyond the lines
+    of so many steps. Then the state of the step before goes. What a step
     writes does not grow with their number.
 
     The folder is the checkpoint's own. ``checkpoint.json`` marks it before anything else is
@@ -132,23 +128,22 @@ class Checkpoint:
                         file.unlink()
                 self._commit(Index(0, self._comm.size))  # until here it says what is to go
 
-    def read(self) -> Kept | None:
-        """Return what was written last, on all ranks; None if nothing was. The folder is locked.
+    def read(self) -> list[Kept]:
+        """Return what was written of each step, on all ranks. The folder is locked.
 
         What a run that was killed has left beside it is removed. Raise an InputError where it is
         damaged.
         """
-        kept: Kept | None = None
+        kept: list[Kept] = []
         with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
             if self._comm.rank == 0 and self._index.number:
-                index, file = self._index, self.path / RECORDS
-                lines = file.read_bytes().splitlines(keepends=True)[: index.number]
-                found = [_unsealed(line, file, INDEX) for line in lines]
-                if len(found) < index.number:
+                file = self.path / RECORDS
+                lines = file.read_bytes().splitlines(keepends=True)[: self._index.number]
+                if len(lines) < self._index.number:
                     raise damaged(file, INDEX)
+                found = [_unsealed(line, file, "it") for line in lines]
+                kept = [Kept(**record.pop("kept"), record=record) for record in found]
                 os.truncate(file, sum(len(line) for line in lines))  # what lies beyond goes
-                fields, owned = ([r.pop(name) for r in found] for name in ("fields", "subdomains"))
-                kept = Kept(index, found, fields, owned)
                 for file in self.path.iterdir():
                     if self._index.owns(file) and not self._index.counts(file):
                         file.unlink()
@@ -159,16 +154,16 @@ class Checkpoint:
     def write(
         self,
         number: int,
-        about: Mapping[str, Any],
         record: Mapping[str, Any],
+        digest: Any,
+        about: Mapping[str, Any],
         state: SavedState,
         fields: Table,
-        digest: Any = "",
     ) -> None:
         """Keep a step; the one before is replaced when this one is whole.
 
-        ``number`` steps have converged then. What is about it, its record and the digest, of what
-        the user has given, are for JSON, those of rank 0; state and fields are this rank's.
+        ``number`` steps have converged then. Record, digest and what is about it are for JSON,
+        those of rank 0; state and fields are this rank's.
         """
         comm, in_state, in_fields = self._comm, "", ""
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
@@ -179,39 +174,36 @@ class Checkpoint:
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
             if checksums is not None:  # on rank 0
                 states, of_fields, parts = (list(c) for c in zip(*checksums, strict=True))
-                before = self._index
-                owned = {"fields": of_fields, "subdomains": parts}
-                line = owned if fields else {key: [] for key in owned}
+                before, kept = self._index, {"digest": digest, "about": about, "states": states}
+                kept |= {"fields": of_fields if fields else [], "subdomains": parts}
                 with (self.path / RECORDS).open("ab") as file:
-                    file.write(_sealed({**record, **line}))
+                    file.write(_sealed({**record, "kept": kept}))
                     _settle(file)
-                ranks = max(before.ranks, comm.size)
-                self._commit(Index(number, ranks, states, parts, digest, dict(about)))
-                for rank in range(len(before.states)):
+                self._commit(Index(number, max(before.ranks, comm.size)))
+                for rank in range(before.ranks):
                     (self.path / f"state_{before.number}_{rank}.npz").unlink(missing_ok=True)
 
-    def read_state(self, kept: Kept) -> SavedState:
-        """Return the state of this rank at the step that ``read`` found."""
-        index = kept.index
-        table = self._load("state", index.number, index.states, index.subdomains, INDEX)
+    def read_state(self, kept: list[Kept]) -> SavedState:
+        """Return the state of this rank at the last step that ``read`` found."""
+        last = kept[-1]
+        table = self._load("state", len(kept), last.states, last.subdomains)
         state = SavedState.from_table(table)
-        own = index.subdomains[self._comm.rank] if self._comm.rank < len(index.states) else []
-        same = self._comm.size == len(index.states) and own == self._subdomains
+        own = last.subdomains[self._comm.rank] if self._comm.rank < len(last.states) else []
+        same = self._comm.size == len(last.states) and own == self._subdomains
         if not any_rank(self._comm, not same):
             return state
         # F may be another there: it depends on K⁺, but for its values up to Gᵀ
         none, directions = np.zeros(0), np.zeros((len(state.lam), 2, 0))
         return replace(state, mu=none, image=none, predicted_image=none, directions=directions)
 
-    def read_fields(self, kept: Kept, number: int) -> Table:
+    def read_fields(self, number: int, kept: Kept) -> Table:
         """Return the fields of a step, of those that ``read`` found, on this rank."""
-        checksums = kept.fields[number - 1]
-        if not checksums:
+        if not kept.fields:
             raise InputError(
                 f"checkpoint {self.path} has no fields of step {number}; expected path= as in "
                 "the run that has written it"
             )
-        return self._load("fields", number, checksums, kept.subdomains[number - 1], RECORDS)
+        return self._load("fields", number, kept.fields, kept.subdomains)
 
     def _save(self, name: str, table: Table) -> str:
         """Write arrays, rows by labels, and how many each subdomain has; return a checksum."""
@@ -228,7 +220,7 @@ class Checkpoint:
         return _hash((self.path / name).read_bytes()).hexdigest()
 
     def _load(
-        self, kind: str, number: int, checksums: list[str], subdomains: list[list[int]], where: str
+        self, kind: str, number: int, checksums: list[str], subdomains: list[list[int]]
     ) -> Table:
         """Return what this rank's subdomains have; rows stand by labels."""
         rank_of = {s: rank for rank, own in enumerate(subdomains) for s in own}
@@ -244,7 +236,7 @@ class Checkpoint:
                 file = self.path / f"{kind}_{number}_{rank}.npz"
                 with named(f"cannot read {file}", OSError):
                     if _hash(file.read_bytes()).hexdigest() != checksums[rank]:
-                        raise damaged(file, where)
+                        raise damaged(file, RECORDS)
                     with np.load(file) as contents:
                         found[rank] = dict(contents)
         table: Table = {}

@@ -399,14 +399,14 @@ class LoadSteps:
             about = {"place": asdict(place), "begin": self._times[0]}
             if place.done:  # where its step goes
                 about["towards"] = self._times[place.number + 1]
-            record, state = asdict(self.records[-1]), self._problem.state()
-            digest = self._problem.digest()
+            record, digest = asdict(self.records[-1]), self._problem.digest()
             labels = labels_of_fields(solution, self._interior) if fields else {}
             table: Table = {
                 name: (as_rows(values, labels[name]), labels[name])
                 for name, values in fields.items()
             }
-            self._checkpoint.write(len(self.records), about, record, state, table, digest)
+            state, number = self._problem.state(), len(self.records)
+            self._checkpoint.write(number, record, digest, about, state, table)
         self._write(t, fields)
 
     def _write(self, t: float, fields: Mapping[str, Array]) -> None:
@@ -425,13 +425,13 @@ class LoadSteps:
         checkpoint = self._checkpoint
         if checkpoint is None:
             return Place()
-        kept = checkpoint.read() if resume else None
-        if kept is None:
+        kept = checkpoint.read() if resume else []
+        if not kept:
             checkpoint.forget()
             return Place()
-        about = kept.index.about
+        about = kept[-1].about
         place = Place(**about["place"])
-        records = [StepRecord(**record) for record in kept.records]
+        records = [StepRecord(**step.record) for step in kept]
         ends = {record.number: record.time for record in records}
         reached = [about["begin"], *(ends[number] for number in range(place.number))]
         reached += [about["towards"]] if place.done else []
@@ -447,15 +447,15 @@ class LoadSteps:
         self._set(records[-1].time)
         digest = self._problem.digest()
         with raised_on_all_ranks(self._comm):
-            check_same_problem(kept.index.digest, digest)
+            check_same_problem(kept[-1].digest, digest)
         self._problem.restore(checkpoint.read_state(kept))
         self.records = records
         if self._path is not None:  # a file of ADIOS2 cannot be continued
             try:
                 here = labels_of_fields(self._problem.solution, self._interior)
-                for number, record in enumerate(records, start=1):
-                    table = checkpoint.read_fields(kept, number)
-                    self._write(record.time, in_order(table, here))
+                for number, step in enumerate(kept, start=1):
+                    table = checkpoint.read_fields(number, step)
+                    self._write(records[number - 1].time, in_order(table, here))
             except TfetiError:  # on all ranks
                 self._close(drop=True)
                 raise
