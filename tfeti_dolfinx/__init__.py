@@ -32,9 +32,9 @@ from typing import TYPE_CHECKING, Any
 
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.partner import Contact, Obstacle
+from tfeti_dolfinx.contact.records import ContactData, ContactStatus
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
-from tfeti_dolfinx.contact.state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh, read_surface
 from tfeti_dolfinx.errors import (
     ConvergenceError,
@@ -49,7 +49,7 @@ from tfeti_dolfinx.io.output import write_pvd, write_vtx, write_xdmf
 from tfeti_dolfinx.io.plot import plot_deformed, plot_friction, plot_pressure
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
-from tfeti_dolfinx.mesh.gmsh_reading import read_gmsh
+from tfeti_dolfinx.mesh.gmsh_input import read_gmsh
 from tfeti_dolfinx.nonlinear.finite_plasticity import FiniteJ2Plasticity
 from tfeti_dolfinx.nonlinear.hyperelasticity import NeoHooke, SaintVenantKirchhoff
 from tfeti_dolfinx.nonlinear.materials import J2Plasticity

@@ -15,8 +15,11 @@ from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import TOLERANCES
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
 from tfeti_dolfinx.contact.records import (
+    ContactData,
+    ContactStatus,
     Friction,
     Resultant,
+    ToolState,
     body_forces,
     condition_areas,
     held_pressures,
@@ -25,7 +28,6 @@ from tfeti_dolfinx.contact.records import (
     vertex_tractions,
 )
 from tfeti_dolfinx.contact.rigid_body import rotation_vector
-from tfeti_dolfinx.contact.state import ContactData, ContactStatus, ToolState
 from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin

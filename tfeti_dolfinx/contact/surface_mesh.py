@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from tfeti_dolfinx.common.arrays import Array, ArrayLike, sum_rows
 from tfeti_dolfinx.common.validation import checked_type, named, real_numbers
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.gmsh_model import open_model
+from tfeti_dolfinx.mesh.gmsh_input import open_model
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 

@@ -20,8 +20,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.files import checked_path
-from tfeti_dolfinx.common.validation import checked_type, named
+from tfeti_dolfinx.common.validation import checked_path, checked_type, named
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.untorn import NO_TAG
 from tfeti_dolfinx.solution import Solution

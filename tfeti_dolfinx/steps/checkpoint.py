@@ -16,9 +16,8 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.files import PARTIAL, written_whole
 from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.common.validation import checked_type, named
+from tfeti_dolfinx.common.validation import PARTIAL, checked_type, named, written_whole
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table, numbered
 
