@@ -429,15 +429,19 @@ class ToolState:
     velocity: Array | None
     spin: Array | None
 
-    def __str__(self) -> str:
-        """One line: names of what is not 0, and its numbers."""
+    @property
+    def _parts(self) -> dict[str, Array]:
         parts = {"displacement": self.displacement, "rotation": self.rotation}
         parts |= {"force": self.resultant.force, "moment": self.resultant.moment}
         if self.velocity is not None and self.spin is not None:
             parts |= {"velocity": self.velocity, "spin": self.spin}
+        return parts
+
+    def __str__(self) -> str:
+        """One line: names of what is not 0, and its numbers."""
         words = [
             f"{what} ({', '.join(f'{value:.6g}' for value in values)})"
-            for what, values in parts.items()
+            for what, values in self._parts.items()
             if what in ("displacement", "force") or np.any(values)
         ]
         return f"{self.name}: {', '.join(words)}"
@@ -445,18 +449,10 @@ class ToolState:
     @property
     def numbers(self) -> dict[str, float]:
         """All components by name, for tables."""
-        axes = "xyz"[: len(self.displacement)]
-        turns = "xyz" if len(axes) == 3 else "z"
-        parts = {
-            "displacement": (axes, self.displacement),
-            "rotation": (turns, self.rotation[-len(turns) :]),
-            "force": (axes, self.resultant.force),
-            "moment": (turns, self.resultant.moment[-len(turns) :]),
-        }
-        if self.velocity is not None and self.spin is not None:
-            parts |= {"velocity": (axes, self.velocity), "spin": (turns, self.spin[-len(turns) :])}
+        flat = len(self.displacement) == 2  # bodies turn about z alone
         return {
             f"{self.name} {what} {axis}": float(value)
-            for what, (names, values) in parts.items()
-            for axis, value in zip(names, values, strict=True)
+            for what, values in self._parts.items()
+            for axis, value in zip("xyz", values, strict=False)
+            if not flat or len(values) == 2 or axis == "z"
         }

@@ -59,7 +59,7 @@ class Index:
 
 @dataclass(frozen=True)
 class Kept:
-    """What is kept of a step: a line of ``records.jsonl``, the same on all ranks."""
+    """A step in a checkpoint: a line of ``records.jsonl``, the same on all ranks."""
 
     record: dict[str, Any]  # its record
     digest: Any  # describes what the user has given
