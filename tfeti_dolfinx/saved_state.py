@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -17,6 +16,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mesh.untorn import mix, set_key
 from tfeti_dolfinx.qp.sets import Status
 from tfeti_dolfinx.solution import Solution
 
@@ -306,13 +306,12 @@ def springs_of(gluing: Gluing) -> Array:
 
 def layout_of(decomposition: Decomposition) -> Array:
     """Return a checksum of each subdomain's cells and their points before the mesh was torn."""
-    order = np.lexsort((decomposition.original_cells, decomposition.cell_subdomain))
-    cells = decomposition.original_cells[order]
-    points = decomposition.original_nodes[geometry_dofmap(decomposition.mesh)[order]]
-    both = np.column_stack((cells, points)).astype(np.int64)
-    starts = np.searchsorted(decomposition.cell_subdomain[order], decomposition.subdomains)
-    parts = np.split(both, starts[1:])[: len(starts)]
-    return np.array([zlib.crc32(part.tobytes()) for part in parts], dtype=np.int64)
+    points = decomposition.original_nodes[geometry_dofmap(decomposition.mesh)]
+    keys = mix(decomposition.original_cells) + set_key(points)
+    sums = np.zeros(len(decomposition.subdomains), dtype=np.uint64)
+    place = np.searchsorted(decomposition.subdomains, decomposition.cell_subdomain)
+    np.add.at(sums, place, mix(keys))
+    return sums
 
 
 def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
