@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from tfeti_dolfinx.mortar.clipping import common_parts
+from tfeti_dolfinx.mortar.segments import common_parts
 
 pytestmark = pytest.mark.usefixtures("serial_only")
 
