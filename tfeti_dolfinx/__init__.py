@@ -34,8 +34,14 @@ from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.partner import Contact, Obstacle
 from tfeti_dolfinx.contact.records import ContactData, ContactStatus
 from tfeti_dolfinx.contact.rigid_body import RigidBody
-from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
-from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh, read_surface
+from tfeti_dolfinx.contact.shapes import (
+    Cylinder,
+    Plane,
+    SignedDistance,
+    Sphere,
+    SurfaceMesh,
+    read_surface,
+)
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     FactorError,

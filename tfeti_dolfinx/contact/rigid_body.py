@@ -20,8 +20,7 @@ from tfeti_dolfinx.common.validation import (
     named,
     shown,
 )
-from tfeti_dolfinx.contact.shapes import Placed, Shape, Vector, check_shape
-from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh
+from tfeti_dolfinx.contact.shapes import Placed, Shape, SurfaceMesh, Vector, check_shape
 from tfeti_dolfinx.errors import InputError
 
 # numbers that may change: fixed, a constant of DOLFINx, or a function of the problem's time
