@@ -32,7 +32,7 @@ from tfeti_dolfinx.forms.checks import (
     is_axisymmetric,
 )
 from tfeti_dolfinx.forms.dirichlet import check_conditions, listed_conditions
-from tfeti_dolfinx.forms.fields import Stress, checked_stress, checked_thickness, frozen
+from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
@@ -135,7 +135,7 @@ class ContactProblem:
         self.u = fem.Function(V, name="displacement") if u is None else checked_function(u, V, "u")
         self._first = np.array(self.u.x.array)
         self._given_stress = stress
-        self._stress: Any = None
+        self._stress: Freezable | None = None
         if stress is not None:
             with agreeing(comm, "stress(u)") as given:
                 given["stress(u)"] = sigma = self._look_at_stress()
@@ -347,7 +347,7 @@ class ContactProblem:
             face,
             gluing,
             system.search.contacts,
-            stress=None if self._stress is None else frozen(self._stress, self.u),
+            stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
             finite=system.origin is not None,
             boundary=system.elements.solved(u),
@@ -586,6 +586,9 @@ class ContactProblem:
 
     def _look_at_stress(self) -> Any:
         """Return the user's stress of ``u`` in UFL, which solutions take until the next look."""
-        if self._given_stress is not None:
-            self._stress = checked_stress(self._given_stress, self.u)
-        return self._stress
+        if self._given_stress is None:
+            return None
+        sigma = checked_stress(self._given_stress, self.u)
+        if self._stress is None or self._stress.expression is not sigma:
+            self._stress = Freezable(sigma, self.u)
+        return sigma

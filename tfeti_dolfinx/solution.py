@@ -96,7 +96,7 @@ class Solution:
         self.gluing, self.dofs, self.decomposition = gluing, gluing.dofs, gluing.dofs.decomposition
         # Bᵀλ now: a problem destroys B with its rows
         self._row_forces = gluing.constraints.forces(self.lam)
-        self.contacts, self.thickness = list(contacts), frozen(thickness)()
+        self.contacts, self.thickness = list(contacts), frozen(thickness)
         self.finite, self.boundary = finite, boundary
         self.tool_motions, self.friction = tool_motions, friction
         self.v: Array | None = None

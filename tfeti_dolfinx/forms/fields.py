@@ -79,24 +79,40 @@ def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
     return thickness
 
 
-def frozen(expression: Any, u: fem.Function | None = None) -> Callable[..., Any]:
-    """Return what makes a UFL expression with its constants and functions as they are now.
+class Freezable:
+    """A UFL expression whose constants and functions, but for one, can be kept as they are.
 
-    It may be of another function than u. Values are copied here, the expression is made when that
-    is called; numbers are as they are. The mesh is no function: where it is moved, the expression
-    moves along.
+    The mesh is no function: where it is moved, the expression moves along. u is the function in it
+    that it is a function of, or None.
     """
+
+    def __init__(self, expression: Any, u: fem.Function | None = None) -> None:
+        self.expression, self._u = expression, u
+        self._constants = extract_constants(expression)
+        self._functions = [f for f in extract_coefficients(expression) if f is not u]
+
+    def frozen(self) -> Callable[..., Any]:
+        """Return what makes the expression, of any function, with what else is in it as it is now.
+
+        Values are copied here, and the expression made when that is called.
+        """
+        values = [np.array(c.value) for c in self._constants]
+        functions = {f: f.copy() for f in self._functions}
+
+        def made(u: fem.Function | None = None) -> Any:
+            pairs = zip(self._constants, values, strict=True)
+            copies = {c: fem.Constant(c.ufl_domain(), value) for c, value in pairs}
+            own = {} if u is None else {self._u: u}
+            return ufl.replace(self.expression, copies | functions | own)
+
+        return made
+
+
+def frozen(expression: Any) -> Any:
+    """Return a UFL expression with its constants and functions as they are now; numbers as is."""
     if not isinstance(expression, ufl.core.expr.Expr):
-        return lambda: expression
-    constants = {c: np.array(c.value) for c in extract_constants(expression)}
-    functions = {f: f.copy() for f in extract_coefficients(expression) if f is not u}
-
-    def made(other: fem.Function | None = None) -> Any:
-        copies = {c: fem.Constant(c.ufl_domain(), value) for c, value in constants.items()}
-        own = {} if other is None else {u: other}
-        return ufl.replace(expression, copies | functions | own)
-
-    return made
+        return expression
+    return Freezable(expression).frozen()()
 
 
 def interpolating(expression: Any, W: fem.FunctionSpace) -> Callable[[fem.Function], None]:
