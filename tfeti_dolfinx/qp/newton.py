@@ -145,10 +145,10 @@ def feasible_start(qp: QP, lam: Array) -> Array:
         found, _ = project_onto_feasible(coarse, within, lam)
         if imbalance(coarse, found) <= UNBALANCED:
             grown = growth(coarse, lam) * lam
-            way, shortest = qp.dot((grown - lam, grown - lam), (found - lam, found - lam))
+            far, shortest = qp.dot((grown - lam, grown - lam), (found - lam, found - lam))
             leaves = any_rank(coarse.comm, qp.feasible.project(grown) != grown)
             leaves |= imbalance(coarse, grown) > HELD
-            return found if way > 4.0 * shortest or leaves else grown
+            return found if far > 4.0 * shortest or leaves else grown
     return first_point(qp)
 
 
@@ -217,17 +217,17 @@ class NewtonIteration:
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
-        qp, normal, z, directions = self.qp, self.coarse.combined, self.z, self.solver.directions
+        qp, Gt, z, directions = self.qp, self.coarse.combined, self.z, self.solver.directions
         directions.norm = directions.norm or seen_norm(qp, z, self.parameters.short)
         self.norm = directions.norm or 1.0
         if self.resume:
             self.mu = self.solver.coarse.coordinates(z.g)
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
-        self.s = self.z.g - normal(self.mu)
+        self.s = self.z.g - Gt(self.mu)
         wanted = self.z.lam - self.s / self.norm
         self.lam_hat, alpha = project_onto_feasible(self.coarse, self.feasible, wanted)
         self.mu = self.mu + self.norm * alpha
-        self.s = self.z.g - normal(self.mu)
+        self.s = self.z.g - Gt(self.mu)
         self.face_hat = self.feasible.face(self.lam_hat, self.s)
         moved = self.z.lam - self.lam_hat
         square, size = qp.dot((moved, moved), (self.z.lam, self.z.lam))
@@ -343,6 +343,8 @@ class FaceSolver:
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
+    _face: Face  # the face entered
+
     def __init__(
         self,
         qp: QP,
@@ -356,11 +358,9 @@ class FaceSolver:
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
         self.directions = Directions(qp, parameters.pcpg)
         self.directions.norm = qp.norm
-        self._face: Face | None = None
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
-        self._status, self.rounds = np.zeros(len(qp.d)), 0
         self.excluding: Array | None = None
-        self.left = np.inf
+        self.left, self.rounds = np.inf, 0
 
     def solve(
         self, start: Point, face: Face, optimality: float, resume: bool, cautious: bool
@@ -390,7 +390,6 @@ class FaceSolver:
             z = restored
         # Step 3c: slipping rows, which followed their tangents, come back onto their boundary
         if self._curved and not out:
-            assert self._face is not None
             boundary = WithinFace(self._qp.feasible, self._face, slipping=True)
             found, _ = project_onto_feasible(self._qp.coarse, boundary, end.lam)
             end = Point(found, end.g + self._qp.roughly(found - end.lam))
@@ -402,13 +401,14 @@ class FaceSolver:
 
         A curved face is made anew; along it the Hessian of q is, to second order, F + Z diag(κ) Zᵀ.
         """
-        qp, before = self._qp, self._face
-        same = before is not None and not any_rank(qp.coarse.comm, face.status != before.status)
+        qp, same = self._qp, False
+        if self._steps.faces:
+            same = not any_rank(qp.coarse.comm, face.status != self._face.status)
         if same and not self._curved:
             return True
         self._steps.faces += not same
         slips = ~face.held & (face.status == Status.SLIP)
-        self._face, self._status = face, face.status
+        self._face = face
         self._curved = any_rank(qp.coarse.comm, slips)
         self.coarse = qp.coarse.on_face(face)
         self._on_face = replace(qp, coarse=self.coarse, preconditioner=None)
@@ -421,7 +421,7 @@ class FaceSolver:
 
     def _blocked(self, z: Point, end: Point) -> Point:
         """Go towards the end just past the first bound of rows that do not slip, onto its face."""
-        qp, way, slips = self._qp, end.lam - z.lam, self._status == Status.SLIP
+        qp, way, slips = self._qp, end.lam - z.lam, self._face.status == Status.SLIP
         bound = qp.feasible.max_step(z.lam, -np.where(slips, 0.0, way))
         length = min(least(qp.coarse.comm, bound), 1.0)
         to = z.lam + (1.0 + self._parameters.past) * length * way
@@ -442,7 +442,7 @@ class FaceSolver:
     def _has_left(self, z: Point) -> bool:
         """Return whether rows that do not slip are outside of Ω."""
         apart = self._qp.feasible.project(z.lam) - z.lam
-        return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._status != Status.SLIP))
+        return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._face.status != Status.SLIP))
 
     def _along_null_space(self, z: Point) -> Point:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
@@ -461,7 +461,7 @@ class FaceSolver:
                 continue
             # to the first bound, maybe infinite; rounding ends no way
             small = given.rounding * largest(qp.coarse.comm, way)
-            moves = (self._status != Status.SLIP) & (np.abs(way) > small)
+            moves = (self._face.status != Status.SLIP) & (np.abs(way) > small)
             bound = qp.feasible.max_step(z.lam, -np.where(moves, way, 0.0))
             length = least(qp.coarse.comm, max(bound, 0.0))
             if np.isfinite(length):
@@ -493,7 +493,6 @@ class FaceSolver:
     def _pcpg(self, z: Point, optimality: float, resume: bool) -> tuple[Point, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
         qp, given, face, own = self._qp, self._parameters, self._face, self.directions
-        assert face is not None
         if self._on_face.preconditioner is None and qp.preconditioner_on is not None:
             self._on_face = replace(self._on_face, preconditioner=qp.preconditioner_on(face))
         own.fresh = own.fresh or not resume or self._curved
