@@ -362,18 +362,17 @@ class System(Generic[OwnForms]):
         gluing.bound_friction(friction, area)
 
     def _assemble_load(self) -> None:
-        self._f = self.elements.load(self.forms)
+        self._load = self.elements.load(self.forms)
         if self._subdomains is not None:
             load = self.tools.load[: self.tools.num_local]
-            self._subdomains.update(f=np.append(self._dofs.to_primal(self._f), load))
+            self._subdomains.update(f=np.append(self._dofs.to_primal(self._load.values), load))
             self._take_rounding(self._subdomains)
 
     def _take_rounding(self, subdomains: Subdomains) -> None:
         """Say what rounding is in loads, of bodies that have a given one none. Collective."""
-        if self.forms.rounding is None:
+        if self._load.rounding is None:
             return
-        known = (self.forms.rounding, self.forms.given_loads)
-        rounding, given = (self._dofs.to_primal(values) for values in known)
+        rounding, given = map(self._dofs.to_primal, (self._load.rounding, self._load.given))
         subdomains.load_rounding[: len(rounding)] = rounding
         parts = subdomains.dof_parts
         (loaded,) = subdomains.of_bodies(
@@ -390,7 +389,7 @@ class System(Generic[OwnForms]):
             again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
         )
         self._subdomains = self._settings.make_subdomains(
-            subdomain_data(dofs, self._K, self._f, trace),
+            subdomain_data(dofs, self._K, self._load.values, trace),
             dofs,
             self._equals,
             self.tools,

@@ -24,7 +24,7 @@ from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.common.parallel import largest
 from tfeti_dolfinx.common.validation import POSITIVE, Range, check_stiffness, checked_number
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.forms.assembly import Data, Forms, data_of
+from tfeti_dolfinx.forms.assembly import Data, Forms, Load, data_of
 from tfeti_dolfinx.forms.checks import check_form, check_same_space, displacement_space
 from tfeti_dolfinx.forms.elasticity import Modulus, in_ufl
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -159,7 +159,7 @@ class InertialForms(Forms):
     def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
         super().__init__(*as_forms)
         self.inertia = Inertia(mass, self._V, self._decomposition, self._compiled)
-        self.inertia.ends = super().load()
+        self.inertia.ends = self._linear()
         self.given = {**self.given, "mass": mass}
         self._K: csr_array | None = None
 
@@ -182,12 +182,12 @@ class InertialForms(Forms):
         """Return this rank's K/2 + 2M/τ²."""
         return 0.5 * self.K + self.inertia.share * self.inertia.M
 
-    def load(self) -> Array:
+    def load(self) -> Load:
         """Return this rank's f + 2Mw/τ² − Ku/2."""
         inertia = self.inertia
-        motion, inertia.ends = inertia.motion, super().load()
+        motion, inertia.ends = inertia.motion, self._linear()
         pull = inertia.M @ motion.towards * inertia.share
-        return 0.5 * (motion.load + inertia.ends) + pull - 0.5 * (self.K @ motion.u)
+        return Load(0.5 * (motion.load + inertia.ends) + pull - 0.5 * (self.K @ motion.u))
 
     def elastic(self, u: Array) -> float:
         """Return this rank's part of uᵀKu/2."""

@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.arrays import (
 )
 from tfeti_dolfinx.common.parallel import count_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.assembly import Forms, Load
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import (
@@ -315,8 +315,8 @@ class FiniteElements:
         """
         return node_blocks(K, self._dofs.bs)[self._dofs.dolfinx_node]
 
-    def load(self, forms: Forms) -> Array:
-        """Return this rank's load in DOLFINx's numbering."""
+    def load(self, forms: Forms) -> Load:
+        """Return this rank's load."""
         return forms.load()
 
     def solved(self, u: Array) -> Any:
