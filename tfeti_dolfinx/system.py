@@ -226,7 +226,7 @@ class System(Generic[OwnForms]):
         elif self._gluing is not None:
             self._gluing = replace(self._gluing, slip=self._slip()[0])
 
-    def begun(self) -> Array:
+    def displacement_at_begin(self) -> Array:
         """Return where the load step began, with free motions of rigid bodies, shape ``(n,)``."""
         u = np.zeros(self.subdomains.num_nodal) if self._begin is None else self._begin
         return np.append(u, self.tools.at_begin()[: self.tools.num_local])

@@ -204,10 +204,10 @@ class InertialNewtonForms(NewtonForms):
     def residual(self) -> Array:
         """Return this rank's R(u); F(u) before the step has a size."""
         F, inertia, motion = super().residual(), self.inertia, self.inertia.motion
-        if not motion.size:
+        if not motion.time_step:
             return F
         with self._in_place():
-            pull = inertia.M @ (self._u.x.array - motion.towards)
+            pull = inertia.M @ (self._u.x.array - motion.predicted)
         return 0.5 * (F - motion.load) + inertia.share * pull
 
     def dead(self) -> Any:
