@@ -366,18 +366,17 @@ class System(Generic[OwnForms]):
         if self._subdomains is not None:
             load = self.tools.load[: self.tools.num_local]
             self._subdomains.update(f=np.append(self._dofs.to_primal(self._load.values), load))
-            self._take_rounding(self._subdomains)
+            self._take_rounding()
 
-    def _take_rounding(self, subdomains: Subdomains) -> None:
-        """Say what rounding is in loads, of bodies that have a given one none. Collective."""
+    def _take_rounding(self) -> None:
+        """Tell subdomains what rounding is in their loads; none beside a given one. Collective."""
         if self._load.rounding is None:
             return
+        subdomains, parts = self.subdomains, self.subdomains.dof_parts
         rounding, given = map(self._dofs.to_primal, (self._load.rounding, self._load.given))
         subdomains.load_rounding[: len(rounding)] = rounding
-        parts = subdomains.dof_parts
-        (loaded,) = subdomains.of_bodies(
-            [[float(np.any(given[part])) for part in parts]], largest=True
-        )
+        has_given = [[float(np.any(given[part])) for part in parts]]
+        (loaded,) = subdomains.of_bodies(has_given, largest=True)
         for part, body in zip(parts, subdomains.body_of_block, strict=True):
             subdomains.load_rounding[part] *= loaded[body] == 0.0
 
@@ -398,7 +397,7 @@ class System(Generic[OwnForms]):
         )
         self._K, self._subdomains.is_tangent = None, self.is_tangent
         self._subdomains.retrace(trace)
-        self._take_rounding(self._subdomains)
+        self._take_rounding()
         self.kplus_number += 1
 
     def _make_dual(self) -> None:

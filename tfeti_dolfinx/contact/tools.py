@@ -124,8 +124,7 @@ class Tools:
         self.velocity: Array = self._unknowns(velocities)
         self.time_step, self.start_velocity = 0.0, self.velocity
         self.predicted_increment = self.loads_at_begin = 0.0 * self.velocity
-        self.law: Array = np.zeros((count, k))
-        self.found: Array = np.zeros((count, k))
+        self.law, self.found = np.zeros((2, count, k))
         self.loads: Array = np.zeros(self.num_unknowns)
         self.poses = [Pose(body.centre(gdim), np.zeros(k), body.large) for body in self.bodies]
         self.begin = list(self.poses)

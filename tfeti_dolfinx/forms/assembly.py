@@ -51,8 +51,7 @@ class Load:
     values: Array
     # what rounding may have made of each entry, if that is more than a share of it; else None
     rounding: Array | None = None
-    # then the part that is given, and known but for its own rounding
-    given: Array = field(default_factory=lambda: np.zeros(0))
+    given: Array = field(default_factory=lambda: np.zeros(0))  # then the part that is given
 
 
 class Forms:

@@ -343,8 +343,6 @@ class FaceSolver:
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
-    _face: Face  # the face entered
-
     def __init__(
         self,
         qp: QP,
@@ -358,6 +356,7 @@ class FaceSolver:
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
         self.directions = Directions(qp, parameters.pcpg)
         self.directions.norm = qp.norm
+        self._face: Face  # that entered
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
         self.excluding: Array | None = None
         self.left, self.rounds = np.inf, 0

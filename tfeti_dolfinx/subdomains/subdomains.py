@@ -162,12 +162,6 @@ class Subdomains:
         pairs = zip(self.blocks, self.kernel_parts, strict=True)
         return joined([block.kernel @ alpha[part] for block, part in pairs])
 
-    # ------------------------------------------------------- rigid bodies' unknowns
-
-    def with_rigid(self, u: Array) -> Array:
-        """Return a displacement of nodes on all unknowns, 0 of rigid bodies, shape ``(n,)``."""
-        return np.append(u, np.zeros(self.size - len(u)))
-
     # ------------------------------------------------------------------- bodies
 
     @property
@@ -230,6 +224,10 @@ class Subdomains:
         return np.ascontiguousarray(found.T)
 
     # ------------------------------------------------------------ displacements
+
+    def with_rigid(self, u: Array) -> Array:
+        """Return a displacement of nodes on all unknowns, 0 of rigid bodies, shape ``(n,)``."""
+        return np.append(u, np.zeros(self.size - len(u)))
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shape ``(n,)``."""
