@@ -86,7 +86,7 @@ class Dual:
             last ``qp`` has multiplied by F for ‖PFP‖, beside the count of F.
         law_target: Rtol of the last solve by Newton's method on Coulomb's law, and what share of
             the residual of its start was little enough.
-        law: Makes the set of multipliers from B and c.
+        make_feasible: Makes the set of multipliers from B and c.
         feasible: The set Ω of multipliers.
         pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
@@ -113,7 +113,7 @@ class Dual:
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints  # before ``bound_friction``
         self._without, self._dimension = without, dimension
-        B, comm = constraints.B, constraints.B.getComm().tompi4py()
+        B, weights, comm = constraints.B, constraints.weights, constraints.B.getComm().tompi4py()
         kept = recycle if isinstance(recycle, int) else 0
         # 1. d
         self._stiffness = largest(comm, subdomains.diagonal)
@@ -125,7 +125,7 @@ class Dual:
         self._scaled: PETSc.Mat | None = None
         makes_schur = preconditioner in (dirichlet_preconditioner, chosen_preconditioner)
         if preconditioner is not None:
-            self._scaled = scaled_rows(B, constraints.weights)
+            self._scaled = scaled_rows(B, weights)
             if makes_schur and "smooth_displacements" in without:
                 schur = subdomains.local_operator("schur")
                 self.preconditioner = DualOperator(self._scaled, schur)
@@ -136,9 +136,8 @@ class Dual:
         if self.preconditioner is not None and makes_schur and self.late is None:
             self._schur = self.preconditioner.local
         # 3. on rows of springs F is 1/σ, M is σ
-        sigma = 1.0
+        sigma = mean_stiffness(subdomains, weights) if subdomains.num_springs else 1.0
         if subdomains.num_springs:
-            sigma = mean_stiffness(subdomains, constraints.weights)
             on_springs: Array = np.zeros(constraints.num_rows)
             on_springs[constraints.sets.springs] = 1.0
             self.F.added = on_springs / sigma
@@ -151,12 +150,12 @@ class Dual:
         self._on_faces: FacePreconditioner | None = None
         if (M := self.preconditioner) is not None:
             if deflation is not None:
-                self.deflation = deflation(B, self.coarse, constraints.weights, of_coarse)
+                self.deflation = deflation(B, self.coarse, weights, of_coarse)
             of_faces, diagonal = f"{prefix}face_", subdomains.diagonal
             self._on_faces = FacePreconditioner(M, constraints, diagonal, of_faces, self.deflation)
         # 5. Ω
         self.contact_rows = constraints.contact_rows
-        self.law, self.feasible = feasible, feasible(constraints)
+        self.make_feasible, self.feasible = feasible, feasible(constraints)
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
         # 6. what solves leave for later ones, and what ``begin_solve`` tells them
         self._norms, self.norm_count = dict[int, float](), 0
@@ -200,7 +199,7 @@ class Dual:
     def pulling(self) -> Array:
         """Rows of contact on this rank that may pull, as a set of one's own lets them."""
         normals, pull = self._given.sets.normals, np.full(len(self.d), -1.0)
-        return normals[self.law(self._given).project(pull)[normals] < 0.0]
+        return normals[self.make_feasible(self._given).project(pull)[normals] < 0.0]
 
     def learn(self) -> None:
         """More solves come: keep directions, where options leave that open, and let S pay.
@@ -254,7 +253,7 @@ class Dual:
         if pressures is not None:
             self.pressures[self._given.pressed] = pressures
             self.constraints = self._given.with_pressures(pressures)
-        self.feasible = self.law(self.constraints)
+        self.feasible = self.make_feasible(self.constraints)
 
     def begin_solve(self, begin: Array | float = 0.0, negligible: Array | float = 0.0) -> None:
         """Count multiplications from 0 on, of a solve in a load step.
@@ -273,9 +272,10 @@ class Dual:
     def qp(self, norm_steps: int = 0) -> QP:
         """Return the quadratic program; without kernel it has no coarse problem.
 
-        ‖PFP‖ is estimated once, by so many Lanczos steps; 0: not at all.
+        Ω is made anew, since c may be another. ‖PFP‖ is estimated once, by so many Lanczos steps;
+        0: not at all.
         """
-        self.feasible = self.law(self.constraints)  # c may be another, and what the law refers to
+        self.feasible = self.make_feasible(self.constraints)
         if norm_steps and norm_steps not in self._norms:
             before = self.F.count
             self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)

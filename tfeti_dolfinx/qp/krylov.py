@@ -97,8 +97,8 @@ class Directions:
         most = max(parameters.numbers // (2 * max(rows, 1)), 1) if parameters.keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
-    def curves(self, pFp: float, pp: float) -> bool:
-        """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding."""
+    def record_curvature(self, pFp: float, pp: float) -> bool:
+        """Take it into the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding."""
         self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
         return pFp > self.parameters.flat * self.norm * pp
 
@@ -170,7 +170,7 @@ def pcpg(
         known = (rz, rp, pFp) if comm.rank == 0 else np.zeros(3)
         squared, rz, rp, pFp = summed(comm, np.array([left @ left, *known]))
         own.helped = max(own.helped, rz / norm**2 if norm > 0.0 else 0.0)
-        if not (own.curves(pFp, pp) and rz > given.flat * own.helped * norm**2):
+        if not (own.record_curvature(pFp, pp) and rz > given.flat * own.helped * norm**2):
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break

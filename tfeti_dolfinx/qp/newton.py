@@ -314,7 +314,7 @@ class NewtonIteration:
         slope, curvature, size = self.qp.dot((-self.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
-        self.solver.directions.curves(curvature, size)
+        self.solver.directions.record_curvature(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         lam = self.feasible.project(z.lam + length * p)
         self._go(Point(lam, z.g + length * Fp), 0.5 * length * slope)
@@ -456,7 +456,7 @@ class FaceSolver:
             if size == 0.0 or curvature > given.rounding * own.norm * square:
                 continue
             w, Fw = self._unseen(w, Fw)
-            if own.curves(*qp.dot((w, Fw), (w, w))):
+            if own.record_curvature(*qp.dot((w, Fw), (w, w))):
                 continue
             # to the first bound, maybe infinite; rounding ends none
             small = given.rounding * largest(qp.coarse.comm, w)

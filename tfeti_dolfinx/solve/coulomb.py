@@ -403,7 +403,7 @@ class NewtonOnLaw:
         cite("newton on friction")
         dual.learn()  # steps differ by few rows, if by any
         qp, normals, tangents = dual.qp(), rows.pressed_by[at], rows.sets.tangents[at]
-        law = Law(lambda known: dual.law(rows.with_pressures(known)), normals, tangents)
+        law = Law(lambda N: dual.make_feasible(rows.with_pressures(N)), normals, tangents)
         # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
         Fx = dual.last.image(qp.F, qp.coarse.comm, start[0])
         dual.norm = dual.norm or seen_norm(qp, Point(start[0], Fx - qp.d))

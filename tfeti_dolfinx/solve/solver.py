@@ -113,7 +113,7 @@ def solve_dual(
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _begin(dual, qp, solver, start)
     # of a set of one's own solvability knows which rows pull, not how much they bear
-    given = dual.law is not contact_set and solver.cold is not None
+    given = dual.make_feasible is not contact_set and solver.cold is not None
     if given and imbalance(qp.coarse, begin.at.lam) > UNBALANCED:
         raise NoSolutionError(
             "extensions: feasible_set has no forces that balance the load; expected a set that "
