@@ -82,7 +82,7 @@ def linear_problem(made, solution):
     forms = Forms(made["a"], made["L"], dofs.V, made["decomposition"], {}, {})
     comm.barrier()
     start = time.perf_counter()
-    K, f = forms.stiffness(), forms.load()
+    K, f = forms.stiffness(), forms.load().values
     seconds = time.perf_counter() - start
     A = untorn(K, dofs)
     b = A.createVecRight()

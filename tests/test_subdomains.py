@@ -44,7 +44,7 @@ def test_energies_and_kernel_motions(scene):
     motion = subdomains.kernel_motion(alpha)
     assert np.abs(multiplied(p, motion)).max(initial=0.0) <= 1e-12
     assert np.allclose(subdomains.kernel_rows @ alpha, motion[subdomains.trace], atol=1e-14)
-    f = p.dofs.to_primal(p._system.forms.load())
+    f = p.dofs.to_primal(p._system.forms.load().values)
     assert subdomains.kernel_load @ alpha == pytest.approx(f @ motion, abs=1e-13)
 
 

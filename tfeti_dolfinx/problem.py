@@ -237,7 +237,7 @@ class ContactProblem:
     def _find(self) -> None:
         """Find the solution, with the data that ranks have met with. Collective."""
         self._system.look_for_changes()
-        self._set_out()
+        self._predict()
         self._solve_in_rounds()
 
     def _solve_in_rounds(self) -> None:
@@ -270,7 +270,7 @@ class ContactProblem:
         dual, gluing = system.dual, system.gluing
         now = self.options
         options = replace(system.options, rtol=now.rtol, atol=now.atol, warnings=now.warnings)
-        dual.begin_solve(system.begun(), self._negligible(dual.subdomains))
+        dual.begin_solve(system.displacement_at_begin(), self._negligible(dual.subdomains))
         # 1. the multipliers
         with stage("solve", seconds):
             start = None
@@ -560,7 +560,7 @@ class ContactProblem:
         """Return displacements of bodies that count as none: without a load step before, 0."""
         return 0.0
 
-    def _set_out(self) -> None:
+    def _predict(self) -> None:
         """Set the prediction of a step; nothing without inertia."""
 
     def _check_state(self, state: SavedState) -> None:

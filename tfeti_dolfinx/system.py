@@ -226,7 +226,7 @@ class System(Generic[OwnForms]):
         elif self._gluing is not None:
             self._gluing = replace(self._gluing, slip=self._slip()[0])
 
-    def begun(self) -> Array:
+    def displacement_at_begin(self) -> Array:
         """Return where the load step began, with free motions of rigid bodies, shape ``(n,)``."""
         u = np.zeros(self.subdomains.num_nodal) if self._begin is None else self._begin
         return np.append(u, self.tools.at_begin()[: self.tools.num_local])
@@ -362,23 +362,21 @@ class System(Generic[OwnForms]):
         gluing.bound_friction(friction, area)
 
     def _assemble_load(self) -> None:
-        self._f = self.elements.load(self.forms)
+        self._load = self.elements.load(self.forms)
         if self._subdomains is not None:
             load = self.tools.load[: self.tools.num_local]
-            self._subdomains.update(f=np.append(self._dofs.to_primal(self._f), load))
-            self._take_rounding(self._subdomains)
+            self._subdomains.update(f=np.append(self._dofs.to_primal(self._load.values), load))
+            self._take_rounding()
 
-    def _take_rounding(self, subdomains: Subdomains) -> None:
-        """Say what rounding is in loads, of bodies that have a given one none. Collective."""
-        if self.forms.rounding is None:
+    def _take_rounding(self) -> None:
+        """Tell subdomains what rounding is in their loads; none beside a given one. Collective."""
+        if self._load.rounding is None:
             return
-        known = (self.forms.rounding, self.forms.given_loads)
-        rounding, given = (self._dofs.to_primal(values) for values in known)
+        subdomains, parts = self.subdomains, self.subdomains.dof_parts
+        rounding, given = map(self._dofs.to_primal, (self._load.rounding, self._load.given))
         subdomains.load_rounding[: len(rounding)] = rounding
-        parts = subdomains.dof_parts
-        (loaded,) = subdomains.of_bodies(
-            [[float(np.any(given[part])) for part in parts]], largest=True
-        )
+        has_given = [[float(np.any(given[part])) for part in parts]]
+        (loaded,) = subdomains.of_bodies(has_given, largest=True)
         for part, body in zip(parts, subdomains.body_of_block, strict=True):
             subdomains.load_rounding[part] *= loaded[body] == 0.0
 
@@ -390,7 +388,7 @@ class System(Generic[OwnForms]):
             again or any(isinstance(x.friction, Coulomb) for x in self._contacts)
         )
         self._subdomains = self._settings.make_subdomains(
-            subdomain_data(dofs, self._K, self._f, trace),
+            subdomain_data(dofs, self._K, self._load.values, trace),
             dofs,
             self._equals,
             self.tools,
@@ -399,7 +397,7 @@ class System(Generic[OwnForms]):
         )
         self._K, self._subdomains.is_tangent = None, self.is_tangent
         self._subdomains.retrace(trace)
-        self._take_rounding(self._subdomains)
+        self._take_rounding()
         self.kplus_number += 1
 
     def _make_dual(self) -> None:

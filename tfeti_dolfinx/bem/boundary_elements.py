@@ -13,7 +13,7 @@ from tfeti_dolfinx.bem.inside import BoundarySolution
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.assembly import Forms, Load
 from tfeti_dolfinx.forms.checks import is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -111,8 +111,8 @@ class BoundaryElementAssembly(FiniteElements):
         assert self._made is not None
         return self._made
 
-    def load(self, forms: Forms) -> Array:
-        """Return this rank's load in DOLFINx's numbering."""
+    def load(self, forms: Forms) -> Load:
+        """Return this rank's load."""
         V, of_volume, hats = self._dofs.V, None, None
         L = forms.given[forms.names[1]]
         parts = [] if is_zero(L) else [i for i in L.integrals() if i.integral_type() == "cell"]
@@ -121,8 +121,8 @@ class BoundaryElementAssembly(FiniteElements):
             one = fem.Constant(V.mesh, (1.0,) + (0.0,) * (self._dofs.bs - 1))
             volume = ufl.dot(one, ufl.TestFunction(V)) * ufl.dx(domain=V.mesh)
             hats = forms.assembled(volume, "the volume")[:: self._dofs.bs][self._dofs.dolfinx_node]
-        replaced = self._parts.load(self._dofs.to_primal(forms.load()), of_volume, hats)
-        return self._dofs.to_dolfinx(replaced)
+        replaced = self._parts.load(self._dofs.to_primal(forms.load().values), of_volume, hats)
+        return Load(self._dofs.to_dolfinx(replaced))
 
     def solved(self, u: Array) -> BoundarySolution:
         """Return the solution, in primal order, inside boundary elements."""

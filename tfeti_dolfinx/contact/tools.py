@@ -66,10 +66,11 @@ class Tools:
             ``(bodies, k)``; 0 but for free ones.
         begin: Where each body was when the load step began.
         mass: That of the unknowns, shape ``(num_unknowns, num_unknowns)``.
-        size: The time step τ of bodies with mass: as nodes they have the stiffness 2M/τ², since
-            their own is 0; 0 where there is no inertia.
-        speed: Velocity of the unknowns when the step began, shape ``(num_unknowns,)``; ``start``
-            what a predictor has left of it, and ``drift`` how far it takes them in the step.
+        law: Motion of each body by its law, shape ``(bodies, k)``.
+        time_step: τ, 0 without inertia; the stiffness is 2M/τ², since the bodies' own is 0.
+        velocity, start_velocity: Those of the unknowns when the time step began, and what a
+            predictor has left of it, shape ``(num_unknowns,)``.
+        predicted_increment: How far the unknowns come in the time step without any force.
         loads_at_begin: Force and moment when the step began.
     """
 
@@ -116,15 +117,14 @@ class Tools:
             by_turns = motion_fields(middle[None])[0, self.mode[turns]] / self._sizes[i]
             self.basis[moves, moves], self.basis[turns, turns] = 1.0, 1.0 / self._sizes[i]
             self.basis[np.ix_(moves, turns)] = -by_turns[:, self.mode[moves]].T
-        masses, speeds = np.zeros((2, count, k))
+        masses, velocities = np.zeros((2, count, k))
         for i, body in enumerate(self.bodies):
-            masses[i], speeds[i] = body.masses(gdim), body.start(gdim)
+            masses[i], velocities[i] = body.masses(gdim), body.start(gdim)
         self.mass = self.basis.T @ (masses[self.tool, self.mode][:, None] * self.basis)
-        self.speed: Array = self._unknowns(speeds)
-        self.start, self.drift = self.speed, 0.0 * self.speed
-        self.loads_at_begin, self.size = 0.0 * self.speed, 0.0
-        self.law: Array = np.zeros((count, k))
-        self.found: Array = np.zeros((count, k))
+        self.velocity: Array = self._unknowns(velocities)
+        self.time_step, self.start_velocity = 0.0, self.velocity
+        self.predicted_increment = self.loads_at_begin = 0.0 * self.velocity
+        self.law, self.found = np.zeros((2, count, k))
         self.loads: Array = np.zeros(self.num_unknowns)
         self.poses = [Pose(body.centre(gdim), np.zeros(k), body.large) for body in self.bodies]
         self.begin = list(self.poses)
@@ -172,25 +172,26 @@ class Tools:
     @property
     def stiffness(self) -> Array:
         """2M/τ² of the unknowns, 0 without inertia."""
-        return self.mass * (2.0 / self.size**2 if self.size else 0.0)
+        return self.mass * (2.0 / self.time_step**2 if self.time_step else 0.0)
 
     @property
     def load(self) -> Array:
         """Mean load on the unknowns and 2Mw/τ², w where they would be without any force."""
-        if not self.size:
+        if not self.time_step:
             return self.loads
         mean = 0.5 * (self.loads_at_begin + self.loads)
-        return np.asarray(mean + self.stiffness @ (self.at_begin() + self.drift))
+        return np.asarray(mean + self.stiffness @ (self.at_begin() + self.predicted_increment))
 
-    def set_out(self, size: float) -> None:
+    def begin_time_step(self, time_step: float) -> None:
         """Begin a time step with the present velocity."""
-        self.size, self.start, self.drift = size, self.speed, size * self.speed
+        self.time_step, self.start_velocity = time_step, self.velocity
+        self.predicted_increment = time_step * self.velocity
 
     @contextmanager
-    def adrift(self) -> Iterator[None]:
-        """Have the free motions where they drift to, for a while."""
+    def at_prediction(self) -> Iterator[None]:
+        """Have the free motions where they are predicted, for a while."""
         known, self.found = self.found, 0.0 * self.found
-        self.found[self.tool, self.mode] = self.basis @ (self.at_begin() + self.drift)
+        self.found[self.tool, self.mode] = self.basis @ (self.at_begin() + self.predicted_increment)
         try:
             yield
         finally:
@@ -200,18 +201,19 @@ class Tools:
         """Return the same bodies with M for a stiffness, and Mw for a load."""
         other = copy.copy(self)
         other.loads = other.loads_at_begin = np.zeros(self.num_unknowns)
-        other.size, other.found = np.sqrt(2.0), self.found.copy()
+        other.time_step, other.found = np.sqrt(2.0), self.found.copy()
         return other
 
-    def way(self) -> Array:
+    def increment(self) -> Array:
         """Return how far the unknowns have come in the load step, shape ``(num_unknowns,)``."""
         return self._unknowns(self.found) - self.at_begin()
 
-    def speed_at_end(self) -> Array:
+    def velocity_at_end(self) -> Array:
         """Return the velocity of the unknowns at the end of the time step."""
-        if not self.size:
+        if not self.time_step:
             return np.zeros(self.num_unknowns)
-        return np.asarray(self.start + 2.0 / self.size * (self.way() - self.drift))
+        apart = self.increment() - self.predicted_increment
+        return np.asarray(self.start_velocity + 2.0 / self.time_step * apart)
 
     def _unknowns(self, motions: Array) -> Array:
         """Return the unknowns that have these motions, of shape ``(bodies, k)``."""
@@ -248,8 +250,8 @@ class Tools:
 
     def begin_here(self) -> None:
         """Let a load step begin where the bodies are, as fast and with the loads that they have."""
-        if self.size:
-            self.speed = self.speed_at_end()
+        if self.time_step:
+            self.velocity = self.velocity_at_end()
         self.loads_at_begin = np.array(self.loads)
         self.begin = [self.pose(i) for i in range(len(self))]
 
@@ -273,12 +275,12 @@ class Tools:
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""
         velocity = np.zeros(self.law.shape)
-        velocity[self.tool, self.mode] = self.basis @ self.speed_at_end()
+        velocity[self.tool, self.mode] = self.basis @ self.velocity_at_end()
         found = list[ToolMotion]()
         for i, body in enumerate(self.bodies):
             contacts, pose = np.flatnonzero(self.of_contact == i), self.pose(i)
-            at, speed = self.poses[i].centre, None if body.mass is None else velocity[i]
-            found.append(ToolMotion(body.name, pose.motion, at, contacts, speed))
+            at, v = self.poses[i].centre, None if body.mass is None else velocity[i]
+            found.append(ToolMotion(body.name, pose.motion, at, contacts, v))
         return found
 
     def take(self, values: Array) -> None:

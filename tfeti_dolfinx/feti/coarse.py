@@ -71,15 +71,17 @@ class CoarseSpace(Coarse):
     ) -> None:
         B, sets = constraints.B, constraints.sets
         self.subdomains, self.comm, self.sigma = subdomains, subdomains.comm, sigma
-        self.bounded, self.rubbing = sets.normals, sets.tangents.ravel()
-        comm, springs = self.comm, sets.springs if subdomains.num_springs else sets.springs[:0]
+        self.bounded, self.rubbing, comm = sets.normals, sets.tangents.ravel(), subdomains.comm
+        self.springs = springs = sets.springs if subdomains.num_springs else sets.springs[:0]
         # 1. rows of B R, and on motions of bodies
         kernel = subdomains.kernel_rows
         offsets = chunk_offsets(comm, kernel.shape[1])
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
-        Gt = transposed_G(B, kernel, dimension)
-        self.springs = springs
+        BR = products(B, kernel)
+        indptr, indices, data = BR.getValuesCSR()
+        Gt = csr_array((data, indices, indptr), shape=(B.getLocalSize()[0], dimension))
+        BR.destroy()
         indptr, _, data = B.getValuesCSR()
         row = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
         sizes = np.bincount(row, np.abs(data), minlength=len(indptr) - 1).astype(float)
@@ -250,15 +252,6 @@ class CoarseSpace(Coarse):
             if grams is not None:
                 found = unresisted(grams, space)
         return cast(Motions, bcast_from_root(self.comm, found))
-
-
-def transposed_G(B: PETSc.Mat, kernel: csr_array, dimension: int) -> csr_array:
-    """Return this rank's rows of B R, with global columns. Collective."""
-    BR = products(B, kernel)
-    indptr, indices, data = BR.getValuesCSR()
-    Gt = csr_array((data, indices, indptr), shape=(B.getLocalSize()[0], dimension))
-    BR.destroy()
-    return Gt
 
 
 def products(B: PETSc.Mat, R: csr_array) -> PETSc.Mat:

@@ -82,10 +82,11 @@ class Dual:
         coarse: The coarse space.
         deflation: Coarse space of the preconditioner, as clusters have one; else None.
         contact_rows: Number of normal and of tangential rows on all ranks.
-        norm: Largest estimate of ‖F‖ that solves have come to, 0 before.
+        norm: Largest estimate of ‖F‖ that solves have come to, 0 before; ``norm_count``: what the
+            last ``qp`` has multiplied by F for ‖PFP‖, beside the count of F.
         law_target: Rtol of the last solve by Newton's method on Coulomb's law, and what share of
             the residual of its start was little enough.
-        law: Makes the set of multipliers from B and c.
+        make_feasible: Makes the set of multipliers from B and c.
         feasible: The set Ω of multipliers.
         pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
@@ -109,64 +110,62 @@ class Dual:
         recycle: int | str,
         dimension: int,
     ) -> None:
-        self._dimension = dimension
-        self._without = without
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints  # before ``bound_friction``
-        self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
-        B, comm = constraints.B, constraints.B.getComm().tompi4py()
+        self._without, self._dimension = without, dimension
+        B, weights, comm = constraints.B, constraints.weights, constraints.B.getComm().tompi4py()
+        kept = recycle if isinstance(recycle, int) else 0
+        # 1. d
         self._stiffness = largest(comm, subdomains.diagonal)
         self._set_linear_term(comm)
+        # 2. F, and M on all rows, from B_D
         self.F = DualOperator(B, subdomains.local_operator("pinv"))
-        self.rough = None if isinstance(recycle, int) and recycle else self.F.rough
+        self.rough = None if kept else self.F.rough
         self.preconditioner: DualOperator | None = None
         self._scaled: PETSc.Mat | None = None
-        own = preconditioner in (dirichlet_preconditioner, chosen_preconditioner)
+        makes_schur = preconditioner in (dirichlet_preconditioner, chosen_preconditioner)
         if preconditioner is not None:
-            self._scaled = scaled_rows(B, constraints.weights)
-            plain = own and "smooth_displacements" in without
-            self.preconditioner = (
-                DualOperator(self._scaled, subdomains.local_operator("schur"))
-                if plain
-                else preconditioner(self._scaled, subdomains)
-            )
-        self._lifting: LocalOperator | None = None
+            self._scaled = scaled_rows(B, weights)
+            if makes_schur and "smooth_displacements" in without:
+                schur = subdomains.local_operator("schur")
+                self.preconditioner = DualOperator(self._scaled, schur)
+            else:
+                self.preconditioner = preconditioner(self._scaled, subdomains)
         self.late = self.preconditioner if isinstance(self.preconditioner, LateDirichlet) else None
-        if self.preconditioner is not None and own and self.late is None:
-            self._lifting = self.preconditioner.local
-        self._held_load: Array | None = None
-        of_coarse, sigma = f"{prefix}coarse_", 1.0
+        self._schur: LocalOperator | None = None
+        if self.preconditioner is not None and makes_schur and self.late is None:
+            self._schur = self.preconditioner.local
+        # 3. on rows of springs F is 1/σ, M is σ
+        sigma = mean_stiffness(subdomains, weights) if subdomains.num_springs else 1.0
         if subdomains.num_springs:
-            sigma = mean_stiffness(subdomains, constraints.weights)
             on_springs: Array = np.zeros(constraints.num_rows)
             on_springs[constraints.sets.springs] = 1.0
             self.F.added = on_springs / sigma
             if self.preconditioner is not None:
                 self.preconditioner.added = sigma * on_springs
+        # 4. G and e, and M on faces
+        of_coarse = f"{prefix}coarse_"
         self.coarse = CoarseSpace(constraints, subdomains, names, sigma, of_coarse)
         self.deflation: Deflation | None = None
         self._on_faces: FacePreconditioner | None = None
-        if self.preconditioner is not None:
+        if (M := self.preconditioner) is not None:
             if deflation is not None:
-                self.deflation = deflation(B, self.coarse, constraints.weights, of_coarse)
-            self._on_faces = FacePreconditioner(
-                self.preconditioner,
-                constraints,
-                subdomains.diagonal,
-                f"{prefix}face_",
-                self.deflation,
-            )
+                self.deflation = deflation(B, self.coarse, weights, of_coarse)
+            of_faces, diagonal = f"{prefix}face_", subdomains.diagonal
+            self._on_faces = FacePreconditioner(M, constraints, diagonal, of_faces, self.deflation)
+        # 5. Ω
         self.contact_rows = constraints.contact_rows
-        self.law, self.feasible = feasible, feasible(constraints)
-        self._norms, self.norm_count = dict[int, float](), 0  # of so many Lanczos steps
+        self.make_feasible, self.feasible = feasible, feasible(constraints)
+        self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
+        # 6. what solves leave for later ones, and what ``begin_solve`` tells them
+        self._norms, self.norm_count = dict[int, float](), 0
         self.norm, self.last, self.law_target = 0.0, KnownProduct(), (0.0, 0.0)
         self.solved: tuple[Array, Array] = np.zeros(0), np.zeros(0)
+        self._learns, self.recycled = recycle == "auto", Recycled(kept, comm) if kept else None
         self.begin: Array | float = 0.0
         self.negligible: Array | float = 0.0
-        self.recycled: Recycled | None = None
-        self._learns = recycle == "auto"
-        if isinstance(recycle, int) and recycle:
-            self.recycled = Recycled(recycle, comm)
+        # 7. the load; what holds it holds its multiples
+        self._held_load: Array | None = None
         self._check_solvable()
 
     def update_load(self) -> None:
@@ -200,7 +199,7 @@ class Dual:
     def pulling(self) -> Array:
         """Rows of contact on this rank that may pull, as a set of one's own lets them."""
         normals, pull = self._given.sets.normals, np.full(len(self.d), -1.0)
-        return normals[self.law(self._given).project(pull)[normals] < 0.0]
+        return normals[self.make_feasible(self._given).project(pull)[normals] < 0.0]
 
     def learn(self) -> None:
         """More solves come: keep directions, where options leave that open, and let S pay.
@@ -211,24 +210,24 @@ class Dual:
         if self._learns and self.recycled is None:
             self.recycled = Recycled(LIMITS.recycled, self.coarse.comm)
         if self.late is not None:
-            self.late.steps = 0
+            self.late.lumped_for = 0
 
-    @property
-    def lifting(self) -> LocalOperator:
-        """S of this rank's subdomains: that of the preconditioner, or made for it.
+    def make_schur(self) -> LocalOperator:
+        """Return S of this rank's subdomains: that of the preconditioner, or made for this.
 
-        Raise a FactorError where the stiffness inside of a subdomain could not be factored.
+        A late preconditioner is Dirichlet's from then on. Raise a FactorError where the stiffness
+        inside of a subdomain could not be factored.
         """
         if self.late is not None:
-            self.late.steps = 0
+            self.late.lumped_for = 0
             self.late.settle()
-            self._lifting = self.late.local
-        if self._lifting is None:
+            self._schur = self.late.local
+        if self._schur is None:
             made = self.subdomains.local_operator("schur", once=True)
             with raised_on_all_ranks(self.coarse.comm):
                 made.prepare()
-            self._lifting = made
-        return self._lifting
+            self._schur = made
+        return self._schur
 
     def _set_linear_term(self, comm: MPI.Intracomm) -> None:
         """Make d = BK⁺f − c, and raise where squares leave floating point. Collective."""
@@ -254,7 +253,7 @@ class Dual:
         if pressures is not None:
             self.pressures[self._given.pressed] = pressures
             self.constraints = self._given.with_pressures(pressures)
-        self.feasible = self.law(self.constraints)
+        self.feasible = self.make_feasible(self.constraints)
 
     def begin_solve(self, begin: Array | float = 0.0, negligible: Array | float = 0.0) -> None:
         """Count multiplications from 0 on, of a solve in a load step.
@@ -273,9 +272,10 @@ class Dual:
     def qp(self, norm_steps: int = 0) -> QP:
         """Return the quadratic program; without kernel it has no coarse problem.
 
-        ‖PFP‖ is estimated once, by so many Lanczos steps; 0: not at all.
+        Ω is made anew, since c may be another. ‖PFP‖ is estimated once, by so many Lanczos steps;
+        0: not at all.
         """
-        self.feasible = self.law(self.constraints)  # c may be another, and what the law refers to
+        self.feasible = self.make_feasible(self.constraints)
         if norm_steps and norm_steps not in self._norms:
             before = self.F.count
             self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)

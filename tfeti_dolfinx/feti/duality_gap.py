@@ -35,7 +35,7 @@ def energy_bound(
         return apart, apart
     change, loss = admissible(dual, forces, displacement, norm)
     lifted = np.empty_like(change)
-    dual.lifting.mult(change, lifted)
+    dual.make_schur().mult(change, lifted)
     comm, ends = dual.coarse.comm, dual.coarse.spring_ends(forces, displacement)
     own = np.array([change @ lifted, dual.coarse.sigma * (ends @ ends), loss])
     moved, stretched, lost = summed(comm, own)

@@ -173,22 +173,22 @@ def dirichlet_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperat
 
 
 class LateDirichlet(DualOperator):
-    """The lumped preconditioner, until it has taken ``steps``; then that of Dirichlet.
+    """The lumped preconditioner for ``lumped_for`` multiplications; then that of Dirichlet.
 
-    Directions of PCPG and of conjugate residuals are kept, so they go on through the change.
-    Without ``steps`` S pays, as more solves come.
+    Directions of PCPG and of conjugate residuals are kept, so they go on through the change. At 0
+    S is made as soon as it is needed, as where more solves come.
     """
 
-    def __init__(self, B: PETSc.Mat, subdomains: Subdomains, steps: int) -> None:
+    def __init__(self, B: PETSc.Mat, subdomains: Subdomains, lumped_for: int) -> None:
         super().__init__(B, subdomains.local_operator("stiffness"))
-        self.steps, self._subdomains = steps, subdomains
+        self.lumped_for, self._subdomains = lumped_for, subdomains
 
     def settle(self) -> None:
         """Make S where it is time. Collective.
 
         Raise a FactorError where the stiffness inside of a subdomain could not be factored.
         """
-        if self.metric is None and self.times >= self.steps:
+        if self.metric is None and self.times >= self.lumped_for:
             made = dirichlet_preconditioner(self.B, self._subdomains)
             self.local, self.metric = made.local, made.metric
             made.destroy()

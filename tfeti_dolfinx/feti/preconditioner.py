@@ -96,7 +96,7 @@ class FacePreconditioner:
         whole: A, and B D⁻¹ = B_D.
         weights: D, of the trace and of what is next to it.
         apply: K on it.
-        steps: Those of p, none without a metric.
+        chebyshev: Steps of p, none without a metric.
         work, jumps: Vectors of the trace, and of the rows.
     """
 
@@ -116,7 +116,7 @@ class FacePreconditioner:
         self._gram = _contact_gram(constraints.B, whole.B, self._contact)
         self._size = _diagonal(whole.B, diagonal)
         self.work, self.jumps = whole.B.createVecs()
-        self.weights, self.steps = constraints.weights, list[tuple[float, float]]()
+        self.weights, self.chebyshev = constraints.weights, list[tuple[float, float]]()
         self._metric: Metric | None = None
         self._diagonal = diagonal
         self._on_all: FaceOperator | None = None
@@ -148,7 +148,7 @@ class FacePreconditioner:
         if metric.hard or top > given.high * size:
             steps, part = given.many_steps, given.wide_range
         if top > 0.0:  # there are rows
-            self.steps = chebyshev(steps, top / part, top)
+            self.chebyshev = chebyshev(steps, top / part, top)
 
     def on_all_rows(self) -> Operator:
         """Return M on all rows: itself where it has no coarse space, and smooths nothing there."""
@@ -269,12 +269,12 @@ class _OnFace:
 
         # 1. the least displacement in D with the jumps x, and smooth
         y.setArray(solved(x))
-        u = smoothed(on.steps, stiff, without_jumps, lifted())
+        u = smoothed(on.chebyshev, stiff, without_jumps, lifted())
         # 2. its forces A u, and back
         v = np.zeros(len(u))
         v[size:] = sizes * u[size:]
         on.whole.multiply(u[:trace], v[:trace])
-        put_jumps(smoothed(on.steps, without_jumps, stiff, v))
+        put_jumps(smoothed(on.chebyshev, without_jumps, stiff, v))
         return solved(y.array_r) + on.whole.added * x
 
     def _solved(self, x: Array) -> Array:

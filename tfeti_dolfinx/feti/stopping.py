@@ -94,6 +94,7 @@ def measure(
     2. v, the least displacement in D that closes that, makes u + v admissible; so ‖v‖_K bounds the
        error of u in energy, as far as λ balances the load.
     3. Sizes and energies of u, of its elastic part and of v, body by body.
+    4. What Gλ − e leaves of the balance of forces.
 
     ``norm`` is ‖F‖, or an estimate; ``before`` the displacement of an earlier iterate.
     """
@@ -103,8 +104,8 @@ def measure(
     w = -state.gap
     overlap, closed = w[normals], state.active[normals]
     # an open row whose force is not gone yet: of distance and force, as a length, the smaller
-    still = norm * within(dual.feasible, state.lam, normals, np.minimum(overlap, 0.0) / norm)
-    w[normals] = np.where(closed | (overlap > 0.0), overlap, still)
+    nearer = norm * within(dual.feasible, state.lam, normals, np.minimum(overlap, 0.0) / norm)
+    w[normals] = np.where(closed | (overlap > 0.0), overlap, nearer)
     lengths = np.abs((w[normals], c[normals])) / constraints.scale
     penetration, gap = np.max(lengths, axis=1, initial=0.0)
     begin = float(np.max(np.abs(dual.begin), initial=0.0)) if state.loose.count else 0.0
@@ -143,7 +144,7 @@ def measure(
         subdomains.extended(subdomains.pinv_load[subdomains.trace]),
     )
     size, elastic, correction, change, alone = subdomains.body_sizes(displacements)
-    # the entry of Gλ − e that is largest beside the forces on its mode; rounding of the largest
+    # 4. the entry of Gλ − e that is largest beside the forces on its mode; rounding of the largest
     # forces is nobody's to mend
     balance = forces = 0.0
     if (coarse := dual.coarse).dimension:

@@ -1,7 +1,7 @@
 """Compiled forms on the torn mesh, their matrices, and whether their data has changed."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import blake2b
 from typing import Any, ClassVar
 
@@ -44,6 +44,16 @@ def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:
     return Data(lambda: [*(c.value for c in values), *(f.x.array for f in functions)], V.mesh.comm)
 
 
+@dataclass(frozen=True)
+class Load:
+    """A load in DOLFINx's numbering, this rank's part."""
+
+    values: Array
+    # what rounding may have made of each entry, if that is more than a share of it; else None
+    rounding: Array | None = None
+    given: Array = field(default_factory=lambda: np.zeros(0))  # then the part that is given
+
+
 class Forms:
     """The compiled forms of a problem. Creation and all methods are collective.
 
@@ -56,15 +66,10 @@ class Forms:
         given: The forms as they were given, by their names.
         thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
             set.
-        rounding: What rounding may have made of each entry of the last load, if that is more than
-            a share of it; else None.
-        given_loads: Then the part of that load that is given, and known but for its own rounding.
         repeats: Whether the last look for changes has assembled a matrix with the entries of the
             one before, as of bodies that stay elastic.
     """
 
-    rounding: Array | None = None
-    given_loads: Array
     repeats: bool = False
     _entries: la.MatrixCSR | None = None
     names: ClassVar[tuple[str, str]] = ("a", "L")
@@ -126,8 +131,12 @@ class Forms:
         self._assembled, self._entries = True, A if self._assembled else None
         return assemble_csr(self._a, A)
 
-    def load(self) -> Array:
-        """Return this rank's f in DOLFINx's numbering."""
+    def load(self) -> Load:
+        """Return this rank's f."""
+        return Load(self._linear())
+
+    def _linear(self) -> Array:
+        """Assemble this rank's part of the linear form."""
         if self._L is None:
             return np.zeros(self._V.dofmap.index_map.size_local * self._V.dofmap.index_map_bs)
         return np.array(fem.assemble_vector(self._L).array)

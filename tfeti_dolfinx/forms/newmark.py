@@ -24,7 +24,7 @@ from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.common.parallel import largest
 from tfeti_dolfinx.common.validation import POSITIVE, Range, check_stiffness, checked_number
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.forms.assembly import Data, Forms, data_of
+from tfeti_dolfinx.forms.assembly import Data, Forms, Load, data_of
 from tfeti_dolfinx.forms.checks import check_form, check_same_space, displacement_space
 from tfeti_dolfinx.forms.elasticity import Modulus, in_ufl
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -46,15 +46,15 @@ class Motion:
     v: Array  # velocity
     load: Array  # load
     # w, where the bodies would be without forces: u + τv, or a predictor
-    towards: Array = field(default_factory=lambda: np.zeros(0))
-    size: float = 0.0  # the step τ, 0 before it is known
+    predicted: Array = field(default_factory=lambda: np.zeros(0))
+    time_step: float = 0.0  # the step τ, 0 before it is known
     # velocity that the step starts with: v, or what a predictor makes of it
-    start: Array = field(default_factory=lambda: np.zeros(0))
+    start_velocity: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def free(self) -> Array:
         """u + τv."""
-        return self.u + self.size * self.v
+        return self.u + self.time_step * self.v
 
 
 class Inertia:
@@ -82,9 +82,9 @@ class Inertia:
         zero = np.zeros(V.dofmap.index_map.size_local * V.dofmap.index_map_bs)
         self.motion, self.ends = Motion(zero, zero, zero), zero
         motion = self.motion
-        self._of_step = Data(lambda: [np.array(motion.size)], self._comm)
+        self._of_step = Data(lambda: [np.array(motion.time_step)], self._comm)
         self._of_m = data_of(mass, V)
-        self._of_motion = Data(lambda: [motion.u, motion.load, motion.towards], self._comm)
+        self._of_motion = Data(lambda: [motion.u, motion.load, motion.predicted], self._comm)
 
     def take_step(self, size: float, same: float = 1e-9) -> None:
         """Let the next step have a size; another one than the last makes the matrix anew.
@@ -94,12 +94,12 @@ class Inertia:
         """
         with agreeing(self._comm, "take_step") as given:
             given["step"] = size = checked_number(size, "step", STEP)
-        known = self.motion.size
+        known = self.motion.time_step
         if abs(size - known) <= same * known:
             return
         if known and self._comm.rank == 0:
             log.warning("the step is now %g, it was %g: all is factored anew", size, known)
-        self.motion.size = size
+        self.motion.time_step = size
 
     def changes(self, moved: bool) -> set[str]:
         """Return which of ``stiffness`` and ``load`` are new since the last call.
@@ -136,14 +136,14 @@ class Inertia:
     @property
     def share(self) -> float:
         """2/τ²."""
-        if not self.motion.size:
+        if not self.motion.time_step:
             raise InputError("the step has no size yet; expected a call of take_step(size) before")
-        return 2.0 / self.motion.size**2
+        return 2.0 / self.motion.time_step**2
 
     def move(self, u: Array, v: Array, load: Array | None = None) -> None:
         """Let the next step begin at a displacement and a velocity, and with the last load."""
         motion = self.motion
-        motion.u, motion.v, motion.start = u, v, v
+        motion.u, motion.v, motion.start_velocity = u, v, v
         motion.load = self.ends if load is None else load
 
 
@@ -159,7 +159,7 @@ class InertialForms(Forms):
     def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
         super().__init__(*as_forms)
         self.inertia = Inertia(mass, self._V, self._decomposition, self._compiled)
-        self.inertia.ends = super().load()
+        self.inertia.ends = self._linear()
         self.given = {**self.given, "mass": mass}
         self._K: csr_array | None = None
 
@@ -182,12 +182,12 @@ class InertialForms(Forms):
         """Return this rank's K/2 + 2M/τ²."""
         return 0.5 * self.K + self.inertia.share * self.inertia.M
 
-    def load(self) -> Array:
+    def load(self) -> Load:
         """Return this rank's f + 2Mw/τ² − Ku/2."""
         inertia = self.inertia
-        motion, inertia.ends = inertia.motion, super().load()
-        pull = inertia.M @ motion.towards * inertia.share
-        return 0.5 * (motion.load + inertia.ends) + pull - 0.5 * (self.K @ motion.u)
+        motion, inertia.ends = inertia.motion, self._linear()
+        pull = inertia.M @ motion.predicted * inertia.share
+        return Load(0.5 * (motion.load + inertia.ends) + pull - 0.5 * (self.K @ motion.u))
 
     def elastic(self, u: Array) -> float:
         """Return this rank's part of uᵀKu/2."""

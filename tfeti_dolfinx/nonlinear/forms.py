@@ -16,7 +16,7 @@ from ufl.corealg.traversal import unique_pre_traversal
 from tfeti_dolfinx.common.arrays import EPSILON, Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import any_rank, least
-from tfeti_dolfinx.forms.assembly import Data, Forms
+from tfeti_dolfinx.forms.assembly import Data, Forms, Load
 from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
@@ -141,7 +141,7 @@ class NewtonForms(Forms):
         with self._in_place():
             return super().stiffness()
 
-    def load(self) -> Array:
+    def load(self) -> Load:
         """Return this rank's J u − F(u), but for what is rounding: that would drive free bodies.
 
         Loads that know nothing of u are no part of that: a small weight stays.
@@ -152,8 +152,7 @@ class NewtonForms(Forms):
         found = self._matrix @ u - self.at_model + dead
         rounding = ROUNDING * (abs(self._matrix) @ (abs(u) + self._length))
         found[abs(found) <= rounding] = 0.0
-        self.rounding, self.given_loads = rounding, dead + np.zeros_like(found)
-        return np.asarray(found - dead)
+        return Load(found - dead, rounding, dead + np.zeros_like(found))
 
     def dead(self) -> Any:
         """Return this rank's part of the residual that is of loads which know nothing of u."""
@@ -165,7 +164,7 @@ class NewtonForms(Forms):
     def residual(self) -> Array:
         """Return this rank's F(u)."""
         with self._in_place():
-            return super().load()
+            return self._linear()
 
     def _in_place(self) -> AbstractContextManager[None]:
         """Integrate over the mesh as it was, in finite strain."""
@@ -205,10 +204,10 @@ class InertialNewtonForms(NewtonForms):
     def residual(self) -> Array:
         """Return this rank's R(u); F(u) before the step has a size."""
         F, inertia, motion = super().residual(), self.inertia, self.inertia.motion
-        if not motion.size:
+        if not motion.time_step:
             return F
         with self._in_place():
-            pull = inertia.M @ (self._u.x.array - motion.towards)
+            pull = inertia.M @ (self._u.x.array - motion.predicted)
         return 0.5 * (F - motion.load) + inertia.share * pull
 
     def dead(self) -> Any:

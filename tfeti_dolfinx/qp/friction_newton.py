@@ -29,7 +29,7 @@ class FrictionParameters:
     # and of the target: no solve leaves less
     followed: float = 0.3
     max_directions: int = 80  # most directions of one solve
-    # of the target: F of a way onto a face that is shorter, times ‖F‖, is not computed
+    # of the target: F of a correction onto a face that is shorter, times ‖F‖, is not computed
     unseen: float = 0.1
     hard: float = 3.0  # times ‖F‖: directions that bend more are scaled down to it
     new: float = 1e-7  # of Az: what earlier directions leave of it, less is rounding
@@ -126,10 +126,10 @@ def newton_on_law(program: LawProgram, at: LawPoint, target: float) -> tuple[Law
     """Solve the natural map of Coulomb's law by a semismooth Newton method. Collective.
 
     Alart, Curnier, Comput. Methods Appl. Mech. Engrg. 92 (1991); Hüeber, Stadler, Wohlmuth, SIAM J.
-    Sci. Comput. 30 (2008). A step multiplies by F once for the way onto its face, if that can be
-    seen, and once for each direction of its solve. It may fail: have something else to try. Return
-    where the residual, ‖F‖ times what is missed, has come down to ``target``, None if it gave up;
-    and the steps taken.
+    Sci. Comput. 30 (2008). A step multiplies by F once for the correction onto its face, if that
+    can be seen, and once for each direction of its solve. It may fail: have something else to try.
+    Return where the residual, ‖F‖ times what is missed, has come down to ``target``, None if it
+    gave up; and the steps taken.
     """
     best, idle, past = np.inf, 0, list[float]()
     # Step 1: the natural map: what a gradient step, brought back, moves, and what Gλ lacks
@@ -210,15 +210,15 @@ def _solved_on_face(
     # Step 3a: λ₁ on the face, and u that restores Gλ = e; s is of λ before
     lam, s = on.entered(at.lam), at.s
     u = oblique.combined(oblique.solve(qp.coarse.residual(lam)))
-    way = lam + on.C.followed(u) - at.lam
+    correction = lam + on.C.followed(u) - at.lam
     basis = known_on(qp.recycled, on, oblique.project)
-    size = program.norm * norm_over(comm, way)
+    size = program.norm * norm_over(comm, correction)
     if size > PARAMETERS.unseen * target:
-        # Step 3b: F of the way, if it can be seen
-        image = qp.F(way)
+        # Step 3b: F of the correction, if it can be seen
+        image = qp.F(correction)
         s = s + image
         if qp.recycled is not None and qp.coarse.dimension == 0:  # else it restores Gλ = e
-            qp.recycled.keep(way, image)
+            qp.recycled.keep(correction, image)
     # Step 3c: conjugate residuals
     b = -oblique.project(s + on.face.bend(u))
     goal = max(share * norm_over(comm, b), PARAMETERS.followed * target)
@@ -227,14 +227,14 @@ def _solved_on_face(
     u, s = u + z, s + image
     if qp.recycled is not None:
         _, new, images = basis[:, known:]
-        ways = on.C.followed(new.T)
+        directions = on.C.followed(new.T)
         # where a face holds a motion by nothing but rounding they do not keep Gλ = e
         kept: Array = np.ones(len(new), dtype=bool)
         if qp.coarse.dimension:
-            missed, terms = np.abs(qp.coarse.G(ways)), qp.coarse.terms(ways)
+            missed, terms = np.abs(qp.coarse.G(directions)), qp.coarse.terms(directions)
             kept = steering(comm, *np.all(missed <= HELD * terms.max(axis=0), axis=0)) > 0.0
-        for way, image in zip(ways.T[kept], images[kept], strict=True):
-            qp.recycled.keep(way, image)
+        for p, image in zip(directions.T[kept], images[kept], strict=True):
+            qp.recycled.keep(p, image)
     mu = oblique.coordinates(s + on.face.bend(u))
     return LawPoint(lam + on.C.followed(u), s - qp.coarse.combined(mu), at.mu + mu)
 

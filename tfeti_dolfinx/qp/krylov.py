@@ -97,8 +97,8 @@ class Directions:
         most = max(parameters.numbers // (2 * max(rows, 1)), 1) if parameters.keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
-    def curves(self, pFp: float, pp: float) -> bool:
-        """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding."""
+    def record_curvature(self, pFp: float, pp: float) -> bool:
+        """Take it into the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding."""
         self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
         return pFp > self.parameters.flat * self.norm * pp
 
@@ -136,7 +136,7 @@ def pcpg(
     """
     own, comm = Directions(qp) if directions is None else directions, qp.coarse.comm
     given = own.parameters
-    recycled, (point, past, norm) = qp.recycled, _begun(qp, point, own)
+    recycled, (point, past, norm) = qp.recycled, _along_recycled(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
     while True:
         # test
@@ -144,7 +144,7 @@ def pcpg(
         reason = _examined(qp, point, rule, norm) if small else ConvergedReason.ITERATING
         if small and reason == ConvergedReason.ITERATING and qp.rough is not None:
             point = point if rule.gradient is None else Point(point.lam, rule.gradient)
-            point, past, norm = _begun(qp, point, own)
+            point, past, norm = _along_recycled(qp, point, own)
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -170,7 +170,7 @@ def pcpg(
         known = (rz, rp, pFp) if comm.rank == 0 else np.zeros(3)
         squared, rz, rp, pFp = summed(comm, np.array([left @ left, *known]))
         own.helped = max(own.helped, rz / norm**2 if norm > 0.0 else 0.0)
-        if not (own.curves(pFp, pp) and rz > given.flat * own.helped * norm**2):
+        if not (own.record_curvature(pFp, pp) and rz > given.flat * own.helped * norm**2):
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
@@ -242,17 +242,18 @@ def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> Converge
     return rule.examine(point.lam, point.g, face, norm, 0.0)
 
 
-def _begun(qp: QP, point: Point, own: Directions) -> tuple[Point, Along | None, float]:
+def _along_recycled(qp: QP, point: Point, own: Directions) -> tuple[Point, Along | None, float]:
     """Minimise q over directions of earlier solves; return where, steps along them, and ‖P g‖.
 
-    Projected twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
+    ``own`` begins there, with r = −P g. Projected twice: the preconditioner does not see what G's
+    factor leaves of Gᵀμ the first time.
     """
     project, recycled, past = qp.coarse.project, qp.recycled, None
     held = None if qp.coarse.face is None else qp.coarse.face.held
     own.r = project(project(-point.g))
     if recycled is not None and (past := recycled.on_face(held)) is not None:
-        way, b = past(own.r, recycled.directions)
+        step, b = past(own.r, recycled.directions)
         # rounding of many directions is none of Gλ = e
-        point = Point(point.lam + project(way), point.g + recycled.images.T @ b)
+        point = Point(point.lam + project(step), point.g + recycled.images.T @ b)
         own.fresh, own.r = True, project(project(-point.g))
     return point, past, norm_over(qp.coarse.comm, own.r)

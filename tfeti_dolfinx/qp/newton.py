@@ -59,18 +59,18 @@ class NewtonParameters:
     # what a solve on a face that stays reduces its residual to, before step 1 looks at it
     stage: float = 0.1
     patience: int = 10  # steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding
-    # steps in a row that do not halve it: from then on ways may be taken in part, and rows leave
+    # steps in a row that do not halve it: from then on steps may be taken in part, and rows leave
     # one by one where a solve has ended without balance
     in_part: int = 3
     one_by_one: int = 20  # most rows that leave a face so, before all leave that are outside
     circle: int = 300  # steps in a row that do not halve ‖g^P‖: q falls by what Gλ = e lacks
     lost: float = 2e-15  # of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖
-    # of the largest entry of a way: less is none; and of ‖F‖: a curvature that rounding may hide
+    # of a direction's largest entry: less is none; and of ‖F‖: a curvature that rounding may hide
     rounding: float = 1e-10
     hidden: float = 1e-15  # of the terms of q: what its differences may be wrong by
     short: float = 1e-6  # of a gradient: a projection that is shorter may be rounding
-    past: float = 1e-15  # of the way to a bound: so far past it, or rounding leaves a force there
-    # of the way to the first bound, where no curvature ends it: more rows than one are to leave
+    past: float = 1e-15  # of a step to a bound: so far past it, or rounding leaves a force there
+    # of the step to the first bound, where no curvature ends it: more rows than one are to leave
     beyond: float = 10.0
     apart: float = 1e-8  # of ‖d‖: rows that want gaps so far apart exclude each other
     takes_part: float = 1e-3  # of such a direction's largest force: rows with less have no part
@@ -145,10 +145,10 @@ def feasible_start(qp: QP, lam: Array) -> Array:
         found, _ = project_onto_feasible(coarse, within, lam)
         if imbalance(coarse, found) <= UNBALANCED:
             grown = growth(coarse, lam) * lam
-            way, shortest = qp.dot((grown - lam, grown - lam), (found - lam, found - lam))
+            far, shortest = qp.dot((grown - lam, grown - lam), (found - lam, found - lam))
             leaves = any_rank(coarse.comm, qp.feasible.project(grown) != grown)
             leaves |= imbalance(coarse, grown) > HELD
-            return found if way > 4.0 * shortest or leaves else grown
+            return found if far > 4.0 * shortest or leaves else grown
     return first_point(qp)
 
 
@@ -217,17 +217,17 @@ class NewtonIteration:
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
-        qp, normal, z, directions = self.qp, self.coarse.combined, self.z, self.solver.directions
+        qp, Gt, z, directions = self.qp, self.coarse.combined, self.z, self.solver.directions
         directions.norm = directions.norm or seen_norm(qp, z, self.parameters.short)
         self.norm = directions.norm or 1.0
         if self.resume:
             self.mu = self.solver.coarse.coordinates(z.g)
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
-        self.s = self.z.g - normal(self.mu)
+        self.s = self.z.g - Gt(self.mu)
         wanted = self.z.lam - self.s / self.norm
         self.lam_hat, alpha = project_onto_feasible(self.coarse, self.feasible, wanted)
         self.mu = self.mu + self.norm * alpha
-        self.s = self.z.g - normal(self.mu)
+        self.s = self.z.g - Gt(self.mu)
         self.face_hat = self.feasible.face(self.lam_hat, self.s)
         moved = self.z.lam - self.lam_hat
         square, size = qp.dot((moved, moved), (self.z.lam, self.z.lam))
@@ -277,16 +277,16 @@ class NewtonIteration:
     def accept(self, end: Point, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
 
-        That is the end of step 3, the point on the way there where q is least, or the projected
+        That is the end of step 3, the point between where q is least, or the projected
         gradient step or the part of it where q is least.
         """
         looked = np.isfinite(self.residual)
         enough = self.parameters.enough * 0.5 / self.norm * self.residual**2 if looked else 0.0
         # on circles s and λ are both large: their product's rounding hides changes of q; what falls
         # is q without terms that Gλ = e makes constant
-        z, way, image = self.z, end.lam - self.z.lam, end.g - self.z.g
+        z, step, image = self.z, end.lam - self.z.lam, end.g - self.z.g
         hidden, slope, curvature = self.qp.dot(
-            (np.abs(z.lam), np.abs(self.s)), (way, -self.s), (way, image)
+            (np.abs(z.lam), np.abs(self.s)), (step, -self.s), (step, image)
         )
         double, needed = 2.0 * slope - curvature, enough - self.parameters.hidden * hidden
         taken = feasible and 0.5 * double >= needed
@@ -299,9 +299,9 @@ class NewtonIteration:
         if taken:
             self._go(end, 0.5 * double)
         elif stuck and feasible and slope < curvature and 0.5 * slope**2 >= needed * curvature:
-            # the way to the end is in Ω, which is convex; q is least here
+            # all of the step is in Ω, which is convex; q is least here
             t, taken = slope / curvature, True
-            self._go(Point(z.lam + t * way, z.g + t * image), 0.5 * t * slope)
+            self._go(Point(z.lam + t * step, z.g + t * image), 0.5 * t * slope)
         if not taken and not looked:
             self.look()
         return taken or self._descend()
@@ -314,7 +314,7 @@ class NewtonIteration:
         slope, curvature, size = self.qp.dot((-self.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
-        self.solver.directions.curves(curvature, size)
+        self.solver.directions.record_curvature(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         lam = self.feasible.project(z.lam + length * p)
         self._go(Point(lam, z.g + length * Fp), 0.5 * length * slope)
@@ -356,11 +356,10 @@ class FaceSolver:
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
         self.directions = Directions(qp, parameters.pcpg)
         self.directions.norm = qp.norm
-        self._face: Face | None = None
+        self._face: Face  # that entered
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
-        self._status, self.rounds = np.zeros(len(qp.d)), 0
         self.excluding: Array | None = None
-        self.left = np.inf
+        self.left, self.rounds = np.inf, 0
 
     def solve(
         self, start: Point, face: Face, optimality: float, resume: bool, cautious: bool
@@ -390,7 +389,6 @@ class FaceSolver:
             z = restored
         # Step 3c: slipping rows, which followed their tangents, come back onto their boundary
         if self._curved and not out:
-            assert self._face is not None
             boundary = WithinFace(self._qp.feasible, self._face, slipping=True)
             found, _ = project_onto_feasible(self._qp.coarse, boundary, end.lam)
             end = Point(found, end.g + self._qp.roughly(found - end.lam))
@@ -402,13 +400,14 @@ class FaceSolver:
 
         A curved face is made anew; along it the Hessian of q is, to second order, F + Z diag(κ) Zᵀ.
         """
-        qp, before = self._qp, self._face
-        same = before is not None and not any_rank(qp.coarse.comm, face.status != before.status)
+        qp, same = self._qp, False
+        if self._steps.faces:
+            same = not any_rank(qp.coarse.comm, face.status != self._face.status)
         if same and not self._curved:
             return True
         self._steps.faces += not same
         slips = ~face.held & (face.status == Status.SLIP)
-        self._face, self._status = face, face.status
+        self._face = face
         self._curved = any_rank(qp.coarse.comm, slips)
         self.coarse = qp.coarse.on_face(face)
         self._on_face = replace(qp, coarse=self.coarse, preconditioner=None)
@@ -421,10 +420,10 @@ class FaceSolver:
 
     def _blocked(self, z: Point, end: Point) -> Point:
         """Go towards the end just past the first bound of rows that do not slip, onto its face."""
-        qp, way, slips = self._qp, end.lam - z.lam, self._status == Status.SLIP
-        bound = qp.feasible.max_step(z.lam, -np.where(slips, 0.0, way))
+        qp, step, slips = self._qp, end.lam - z.lam, self._face.status == Status.SLIP
+        bound = qp.feasible.max_step(z.lam, -np.where(slips, 0.0, step))
         length = min(least(qp.coarse.comm, bound), 1.0)
-        to = z.lam + (1.0 + self._parameters.past) * length * way
+        to = z.lam + (1.0 + self._parameters.past) * length * step
         to = np.where(slips, to, qp.feasible.project(to))
         z = Point(to, z.g + length * (end.g - z.g))
         self._enter(qp.feasible.face(to, z.g - qp.coarse.combined(self.coarse.coordinates(z.g))))
@@ -442,33 +441,33 @@ class FaceSolver:
     def _has_left(self, z: Point) -> bool:
         """Return whether rows that do not slip are outside of Ω."""
         apart = self._qp.feasible.project(z.lam) - z.lam
-        return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._status != Status.SLIP))
+        return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._face.status != Status.SLIP))
 
     def _along_null_space(self, z: Point) -> Point:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
-        Where no bound ends the way, neither F nor G sees it and q falls along it, rows that depend
+        Where no bound ends it, neither F nor G sees it and q falls along it, rows that depend
         on each other want gaps that exclude each other: ``excluding`` says so.
         """
         own, qp, given = self.directions, self._qp, self._parameters
-        for way in (own.p, own.r):
-            size, Fw = largest(qp.coarse.comm, way), qp.F(way)
-            curvature, square = qp.dot((way, Fw), (way, way))
+        for w in (own.p, own.r):
+            size, Fw = largest(qp.coarse.comm, w), qp.F(w)
+            curvature, square = qp.dot((w, Fw), (w, w))
             if size == 0.0 or curvature > given.rounding * own.norm * square:
                 continue
-            way, Fw = self._unseen(way, Fw)
-            if own.curves(*qp.dot((way, Fw), (way, way))):
+            w, Fw = self._unseen(w, Fw)
+            if own.record_curvature(*qp.dot((w, Fw), (w, w))):
                 continue
-            # to the first bound, maybe infinite; rounding ends no way
-            small = given.rounding * largest(qp.coarse.comm, way)
-            moves = (self._status != Status.SLIP) & (np.abs(way) > small)
-            bound = qp.feasible.max_step(z.lam, -np.where(moves, way, 0.0))
+            # to the first bound, maybe infinite; rounding ends none
+            small = given.rounding * largest(qp.coarse.comm, w)
+            moves = (self._face.status != Status.SLIP) & (np.abs(w) > small)
+            bound = qp.feasible.max_step(z.lam, -np.where(moves, w, 0.0))
             length = least(qp.coarse.comm, max(bound, 0.0))
             if np.isfinite(length):
                 step = given.beyond * length
-                return Point(z.lam + step * way, z.g + step * Fw)
+                return Point(z.lam + step * w, z.g + step * Fw)
             # Farkas: p in the cone of recession of Ω with Fp = 0, Gp = 0 and dᵀp > 0
-            p = qp.feasible.project(given.far / size * way) * (size / given.far)
+            p = qp.feasible.project(given.far / size * w) * (size / given.far)
             Qp, d, Fp = p - qp.coarse.project(p), qp.d, qp.F(p)
             FF, QQ, pp, pd, dd = qp.dot((Fp, Fp), (Qp, Qp), (p, p), (p, d), (d, d))
             unseen = max(FF / max(own.norm, TINY) ** 2, QQ) <= given.rounding**2 * pp
@@ -478,22 +477,21 @@ class FaceSolver:
             break
         return z
 
-    def _unseen(self, way: Array, Fw: Array) -> tuple[Array, Array]:
+    def _unseen(self, w: Array, Fw: Array) -> tuple[Array, Array]:
         """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see.
 
-        What PCPG has left of the others in w is small beside it, but its bounds would end the way.
+        What PCPG has left of the others in w is small beside it, but its bounds would end it.
         """
         qp, given = self._qp, self._parameters
-        exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
+        exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((w, w))[0]))
         program = replace(self._on_face, F=qp.F, rough=None, d=Fw, recycled=None)
-        zero, own = Point(np.zeros(len(way)), -Fw), Directions(qp)
+        zero, own = Point(np.zeros(len(w)), -Fw), Directions(qp)
         end, _ = pcpg(program, zero, StoppingRule(exact), Steps(), given.purifying, directions=own)
-        return way - end.lam, -end.g
+        return w - end.lam, -end.g
 
     def _pcpg(self, z: Point, optimality: float, resume: bool) -> tuple[Point, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
         qp, given, face, own = self._qp, self._parameters, self._face, self.directions
-        assert face is not None
         if self._on_face.preconditioner is None and qp.preconditioner_on is not None:
             self._on_face = replace(self._on_face, preconditioner=qp.preconditioner_on(face))
         own.fresh = own.fresh or not resume or self._curved

@@ -105,7 +105,7 @@ def solve_with_friction(
     steps, looks, iterations = Steps(), 0, 0
     # Step 0: the first bounds: of Newton's method on the law, else those of the start
     law = newton.solve(start, bounds)
-    motion = None if law else bounds.hold()
+    motion = None if law else bounds.set_feasible()
     while True:
         # Step 1: the problem with these bounds; those of the law are worth all digits
         if law is None:
@@ -123,19 +123,19 @@ def solve_with_friction(
             if law:
                 looked = aim == np.inf and result.reason == ConvergedReason.DIVERGED_ITS
                 law = newton.go_on(law, bounds, reached, looked)
-            elif not bounds.turn(result):
+            elif not bounds.try_others(result):
                 break
             aim = reached
-            if not law and (motion := bounds.hold()) is not None:
+            if not law and (motion := bounds.set_feasible()) is not None:
                 break
             continue
         # Step 3: its forces of normals, beside those that the bounds are of
-        change = bounds.change(result.lam)
+        change = bounds.take_forces(result.lam)
         near = change <= PARAMETERS.near * tolerance
         aim = reached * min(1.0, least / asked)  # residuals and errors fall together
         # Step 4: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
-            if goal is not None or bounds.fit(result, rule):
+            if goal is not None or bounds.fit_law(result, rule):
                 break
             if newton.tries == 0 and (bounds.idle > 1 or iterations >= options.friction_max_it):
                 result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
@@ -148,7 +148,7 @@ def solve_with_friction(
         bounds.advance()
         law = newton.solve(start, bounds, aim) if moved else None
         found = bounds.now
-        motion = None if law else bounds.hold()
+        motion = None if law else bounds.set_feasible()
         start = start if bounds.now is found else None  # with other bounds anew
         restless = bounds.idle > PARAMETERS.patience or iterations >= options.friction_max_it
         if motion is not None or restless:
@@ -216,7 +216,7 @@ class FrictionBounds:
             on_loose[coarse.J.row[loose[coarse.J.body]]] = True
             unknown = np.any(on_loose[tangents[at]], axis=1) & (self._mu > 0.0)
             self.now = np.where(unknown, np.inf, self.now)
-        # what ``hold`` and ``turn`` have not tried yet
+        # what ``set_feasible`` and ``try_others`` have not tried yet
         self._others = [*([] if start is None else [np.inf]), *PARAMETERS.shares]
         self._turns = 2
         self.found = self.now
@@ -225,11 +225,11 @@ class FrictionBounds:
         self.idle, self.body = 0, -1
 
     @property
-    def stick(self) -> bool:
-        """True if some bounds are not set yet, so that their points stick."""
+    def some_stick(self) -> bool:
+        """True if some bounds are not set yet, so that their points stick. Collective."""
         return any_rank(self._comm, np.isinf(self.now))
 
-    def hold(self) -> Array | None:
+    def set_feasible(self) -> Array | None:
         """Set the present bounds, else others, each once; return a motion that they let go.
 
         Others are those of points that all stick. These may hang where they do not touch, which
@@ -238,7 +238,7 @@ class FrictionBounds:
         dual, first = self._dual, None
         while True:
             dual.bound_friction(self.now)
-            if self.stick:
+            if self.some_stick:
                 return None
             motion = sliding_motion(dual.coarse, dual.constraints, dual.pulling)
             first = motion if first is None else first
@@ -258,7 +258,7 @@ class FrictionBounds:
         np.maximum.at(weights, coarse.J.row, loads[coarse.J.body])
         return np.asarray((weights / coarse.row_size)[self._rows])
 
-    def turn(self, result: QPResult) -> bool:
+    def try_others(self, result: QPResult) -> bool:
         """Take other bounds after a problem without an answer; return whether there are any.
 
         Where sticking contradicts itself, as beside a wall that pushes, or bounds of forces that
@@ -267,7 +267,7 @@ class FrictionBounds:
         """
         reason, slips = result.reason, not any_rank(self._comm, self.now > 0.0)
         lost = reason in (ConvergedReason.DIVERGED_STALLED, ConvergedReason.DIVERGED_ROUNDING)
-        contradicts = self.stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
+        contradicts = self.some_stick and reason == ConvergedReason.DIVERGED_CONTRADICTION
         found = self.forces_of(result.lam)
         if (lost or contradicts) and self._turns == 2 and not slips:
             self.now, self._turns = np.zeros(len(self._rows)), 1
@@ -277,7 +277,7 @@ class FrictionBounds:
             return False
         return True
 
-    def change(self, values: Array) -> float:
+    def take_forces(self, values: Array) -> float:
         """Store a solve's normal forces; return their relative distance from the bounds.
 
         Body by body, as nodal forces of friction: beside forces elsewhere those on a light one
@@ -288,7 +288,7 @@ class FrictionBounds:
         moves_none = float(np.min(self._dual.negligible)) / (self._dual.norm or np.inf)
         self._none = max(PARAMETERS.no_force * most, moves_none)
         self.found = self.forces_of(values)
-        if self.stick:
+        if self.some_stick:
             return float("inf")
         nothing = np.full(len(self._rows), self._none)
         miss, size, least = map(self._on_bodies, (self.found - self.now, self.found, nothing))
@@ -303,7 +303,7 @@ class FrictionBounds:
             self._best, self.idle = change, 0
         return change
 
-    def fit(self, result: QPResult, rule: Accuracy) -> bool:
+    def fit_law(self, result: QPResult, rule: Accuracy) -> bool:
         """Return whether u is right to rtol with the limits that the new forces give, too.
 
         From then on the rule tells the larger errors.
@@ -318,10 +318,10 @@ class FrictionBounds:
         now, found = self.now, self.found
         # forces that fall to less than half again and again, as where slips of earlier steps alone
         # drive, make a geometric series: of its bounds the limit 0 is tried
-        if self._falls == PARAMETERS.falls and not self.stick:
+        if self._falls == PARAMETERS.falls and not self.some_stick:
             self.now = np.zeros_like(found)
         else:
-            share = 1.0 if self.stick else self._relaxation()
+            share = 1.0 if self.some_stick else self._relaxation()
             self.now = found if share == 1.0 else now + share * (found - now)
         self._last = now, found
 
@@ -330,8 +330,8 @@ class FrictionBounds:
         if self._last is None or any_rank(self._comm, np.isinf(self._last[0])):  # all stuck
             return 1.0
         (first, of_first), now, found = self._last, self.now, self.found
-        way, turn = now - first, (found - now) - (of_first - first)
-        along, size = summed(self._comm, np.array([-(way @ turn), turn @ turn]))
+        step, turn = now - first, (found - now) - (of_first - first)
+        along, size = summed(self._comm, np.array([-(step @ turn), turn @ turn]))
         share = along / size if along > 0.0 else 1.0  # else they run away, to other ones
         return float(steering(self._comm, np.clip(share, PARAMETERS.shortest, 1.0))[0])
 
@@ -392,7 +392,7 @@ class NewtonOnLaw:
         far as a look has told. None where it fails, or is not tried, as without a start.
         """
         dual = self._dual
-        if start is None or self.tries == 0 or bounds.stick:
+        if start is None or self.tries == 0 or bounds.some_stick:
             return None
         rows, at = dual.constraints, dual.constraints.pressed
         if not any_rank(dual.coarse.comm, start[0][rows.pressed_by[at]] > 0.0):
@@ -403,7 +403,7 @@ class NewtonOnLaw:
         cite("newton on friction")
         dual.learn()  # steps differ by few rows, if by any
         qp, normals, tangents = dual.qp(), rows.pressed_by[at], rows.sets.tangents[at]
-        law = Law(lambda known: dual.law(rows.with_pressures(known)), normals, tangents)
+        law = Law(lambda N: dual.make_feasible(rows.with_pressures(N)), normals, tangents)
         # Step 1: the start or its multiple, with its μ or that of least squares: the least residual
         Fx = dual.last.image(qp.F, qp.coarse.comm, start[0])
         dual.norm = dual.norm or seen_norm(qp, Point(start[0], Fx - qp.d))

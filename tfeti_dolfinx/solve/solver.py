@@ -112,7 +112,7 @@ def solve_dual(
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _begin(dual, qp, solver, start)
     # of a set of one's own solvability knows which rows pull, not how much they bear
-    given = dual.law is not contact_set and solver.cold is not None
+    given = dual.make_feasible is not contact_set and solver.cold is not None
     if given and imbalance(qp.coarse, begin.at.lam) > UNBALANCED:
         raise NoSolutionError(
             "extensions: feasible_set has no forces that balance the load; expected a set that "
@@ -125,8 +125,8 @@ def solve_dual(
     own, most = getattr(options, qp_type), options.max_it
     result = solver.solve(qp, begin, rule, own, max_it=most, monitor=monitor or no_monitor)
     rounding = result.reason == ConvergedReason.DIVERGED_ROUNDING
-    if rounding and (late := dual.late) is not None and late.metric is None and late.steps:
-        late.steps = 0  # K_bb of thin parts spans more digits than S: begin again
+    if rounding and (late := dual.late) is not None and late.metric is None and late.lumped_for:
+        late.lumped_for = 0  # K_bb of thin parts spans more digits than S: begin again
         return solve_dual(dual, options, start, monitor, goal, make_rule)
     broken = rounding or result.reason == ConvergedReason.DIVERGED_INDEFINITE_MAT
     if broken and dual.rough is not None:

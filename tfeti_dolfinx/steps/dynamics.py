@@ -43,17 +43,17 @@ NAMES = ("load", "contact", "friction", "supports", "predictor")
 
 
 def _kinetics(
-    M: Any, size: float, v: Array, start: Array, end: Array, way: Array, drift: Array, load: Array
+    M: Any, tau: float, v: Array, start: Array, end: Array, du: Array, dw: Array, load: Array
 ) -> Array:
     """Kinetic energy at the end and at the begin of a step, work of the load and the predictor.
 
-    Velocities are that at the begin, that which the step starts with, and that at the end; without
-    forces ``way`` is ``drift``.
+    Velocities are that at the begin, that which the step starts with, and that at the end; ``du``
+    is the increment of the displacement, ``dw`` the predicted one, which it is without forces.
     """
     moving, started = v @ (M @ v), start @ (M @ start)
-    predicted = -2.0 / size**2 * (drift - size * start) @ (M @ (way - drift))
+    predicted = -2.0 / tau**2 * (dw - tau * start) @ (M @ (du - dw))
     predicted += 0.5 * (started - moving)
-    return np.array([0.5 * end @ (M @ end), 0.5 * moving, load @ way, predicted])
+    return np.array([0.5 * end @ (M @ end), 0.5 * moving, load @ du, predicted])
 
 
 def balance(
@@ -70,10 +70,10 @@ def balance(
     inertia, motion = forms.inertia, forms.inertia.motion
     u, v = solution.dofs.to_dolfinx(solution.u), solution.v
     assert v is not None
-    way, drift, own_tools = u - motion.u, motion.towards - motion.u, slice(tools.num_local)
-    sets, primal = dual.constraints.sets, solution.dofs.to_primal(way)
-    all_way = np.append(primal, tools.way()[own_tools])
-    done = -solution.lam * dual.constraints.jumps(all_way[dual.subdomains.trace])  # −λᵀB Δu
+    du, dw, du_tools = u - motion.u, motion.predicted - motion.u, tools.increment()
+    sets, primal = dual.constraints.sets, solution.dofs.to_primal(du)
+    all_du = np.append(primal, du_tools[: tools.num_local])
+    done = -solution.lam * dual.constraints.jumps(all_du[dual.subdomains.trace])  # −λᵀB Δu
     of_rows = [done[r].sum() for r in (sets.normals, sets.tangents.ravel(), sets.equalities)]
     # rows know nothing of prescribed components: supports that draw nodes bear their friction
     rubs = 0.0
@@ -81,21 +81,22 @@ def balance(
         records = solution.gluing.records
         along = relative_displacement(records, solution.dofs, primal) + records.motion
         rigid = tools.entries(records)
-        np.add.at(along, rigid.condition, rigid.direction * tools.way()[rigid.unknown, None])
+        np.add.at(along, rigid.condition, rigid.direction * du_tools[rigid.unknown, None])
         rubs = np.sum(solution.tangential_force * along) - of_rows[1]
-    of_nodes = (motion.v, motion.start, v, way, drift, 0.5 * (motion.load + inertia.ends))
-    both = _kinetics(inertia.M, motion.size, *of_nodes)
+    of_nodes = (motion.v, motion.start_velocity, v, du, dw, 0.5 * (motion.load + inertia.ends))
+    both = _kinetics(inertia.M, motion.time_step, *of_nodes)
     if tools.num_local:
         load = 0.5 * (tools.loads_at_begin + tools.loads)
-        of_tools = (tools.speed, tools.start, tools.speed_at_end(), tools.way(), tools.drift, load)
-        both += _kinetics(tools.mass, motion.size, *of_tools)
+        velocities = (tools.velocity, tools.start_velocity, tools.velocity_at_end())
+        moved = (*velocities, du_tools, tools.predicted_increment)
+        both += _kinetics(tools.mass, motion.time_step, *moved, load)
     own = [forms.elastic(u), forms.elastic(motion.u), *np.add(of_rows, (0.0, rubs, -rubs)), *both]
     elastic, before, *rows, kinetic, moving, load_work, predicted = map(
         float, summed(solution.dofs.comm, np.array(own))
     )
     before, work = before + moving, [load_work, *rows, predicted]
     return {
-        "size": motion.size,
+        "size": motion.time_step,
         "kinetic": kinetic,
         "elastic": elastic,
         "energy": kinetic + elastic,
@@ -197,7 +198,7 @@ class Predictor:
             nodal = self._subdomains.num_nodal
             if tools.num_unknowns:
                 bodies.take(accuracy.u[nodal:])
-                tools.drift = bodies.way()
+                tools.predicted_increment = bodies.increment()
             return dofs.to_dolfinx(accuracy.u[:nodal])
         finally:
             constraints.c[:] = before
@@ -322,19 +323,19 @@ class ContactDynamics(ContactProblem):
         self._look()
         return self.u
 
-    def _set_out(self) -> None:
+    def _predict(self) -> None:
         inertia, system = self._system.forms.inertia, self._system
         motion = inertia.motion
-        motion.towards = free = motion.free
-        system.tools.set_out(motion.size)
+        motion.predicted = free = motion.free
+        system.tools.begin_time_step(motion.time_step)
         if self._predictor is not None:  # what contact allows the bodies without elasticity
             system.make(self._seconds, "right side")
-            with system.tools.adrift():
+            with system.tools.at_prediction():
                 overlap = system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0)
             if overlap:
                 system.change("constraints")
                 system.make(self._seconds, "right side")
-            motion.towards = self._predictor.nearest(free, inertia.M, system.gluing, system.tools)
+            motion.predicted = self._predictor.nearest(free, inertia.M, system.gluing, system.tools)
         system.change("load")
 
     def accept(self) -> None:
@@ -354,8 +355,8 @@ class ContactDynamics(ContactProblem):
         motion, state = self._system.forms.inertia.motion, super().state()
         v, load = self.dofs.to_primal(motion.v), self.dofs.to_primal(motion.load)
         tools = self._system.tools
-        state = replace(state, velocity=v, load=load, size=np.array(motion.size))
-        state = replace(state, tool_speed=tools.speed, tool_loads=tools.loads_at_begin)
+        state = replace(state, velocity=v, load=load, size=np.array(motion.time_step))
+        state = replace(state, tool_speed=tools.velocity, tool_loads=tools.loads_at_begin)
         if self._predictor is None or self._accepted is None:
             return state
         predicted, image = self._predictor.start(self._accepted[0].gluing)
@@ -379,7 +380,7 @@ class ContactDynamics(ContactProblem):
     def _check_state(self, state: SavedState) -> None:
         super()._check_state(state)
         size = len(self.u.x.array)
-        tools = self._system.tools.speed.shape
+        tools = self._system.tools.velocity.shape
         if state.velocity.shape != (size,) or state.load.shape != (size,):
             raise InputError("the state is of a problem without mass; expected velocities")
         if state.tool_speed.shape != tools or state.tool_loads.shape != tools:
@@ -388,13 +389,13 @@ class ContactDynamics(ContactProblem):
     def _take_motion(self, state: SavedState) -> None:
         inertia = self._system.forms.inertia
         inertia.move(*map(self.dofs.to_dolfinx, (state.u, state.velocity, state.load)))
-        inertia.motion.towards = inertia.motion.free
+        inertia.motion.predicted = inertia.motion.free
         if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
-            inertia.motion.size = float(state.size)
+            inertia.motion.time_step = float(state.size)
         tools = self._system.tools
-        tools.speed, tools.loads_at_begin = state.tool_speed, state.tool_loads
-        tools.set_out(inertia.motion.size)
-        tools.drift = 0.0 * tools.speed  # at the end of a step: so fast it has been there
+        tools.velocity, tools.loads_at_begin = state.tool_speed, state.tool_loads
+        tools.begin_time_step(inertia.motion.time_step)
+        tools.predicted_increment = 0.0 * tools.velocity  # so fast it is at the end of a step
         super()._take_motion(state)
 
     def destroy(self) -> None:
@@ -406,8 +407,8 @@ class ContactDynamics(ContactProblem):
     def _make_solution(self, u: Array, lam: Array, face: Face, gluing: Gluing) -> Solution:
         solution = super()._make_solution(u, lam, face, gluing)
         motion = self._system.forms.inertia.motion
-        way = self.dofs.to_dolfinx(u) - motion.towards
-        solution.v = motion.start + 2.0 / motion.size * way
+        way = self.dofs.to_dolfinx(u) - motion.predicted
+        solution.v = motion.start_velocity + 2.0 / motion.time_step * way
         return solution
 
     def _look(self) -> None:
@@ -497,8 +498,8 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
             self._system.change("places")  # else a law that moves a tool may leave its place
         try:
             self._system.look_for_changes()
-            self._set_out()
-            if self._places is not None and self._system.forms.inertia.motion.size:
+            self._predict()
+            if self._places is not None and self._system.forms.inertia.motion.time_step:
                 self._project_velocity()
         finally:
             if self._places is not None:
@@ -512,14 +513,14 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         What a node keeps of the velocity with which it hits would work where normals turn.
         """
         motion, predictor = self._system.forms.inertia.motion, self._predictor
-        motion.start, self._blows = motion.v, []
+        motion.start_velocity, self._blows = motion.v, []
         if predictor is None or predictor.last is None:
             return
-        motion.start = (motion.towards - motion.u) / motion.size
+        motion.start_velocity = (motion.predicted - motion.u) / motion.time_step
         tools = self._system.tools
-        tools.start = tools.drift / motion.size
-        (lam, face), w = predictor.last, self.dofs.to_primal(motion.towards)
-        forces, gluing = lam / motion.size**2, self._system.gluing
+        tools.start_velocity = tools.predicted_increment / motion.time_step
+        (lam, face), w = predictor.last, self.dofs.to_primal(motion.predicted)
+        forces, gluing = lam / motion.time_step**2, self._system.gluing
         struck = ContactProblem._make_solution(self, w, forces, face, gluing)
         self._blows = [struck.contact(i).resultant.force for i in range(len(self.contacts))]
 

@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.arrays import (
 )
 from tfeti_dolfinx.common.parallel import count_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.assembly import Forms, Load
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import (
@@ -162,12 +162,6 @@ class Subdomains:
         pairs = zip(self.blocks, self.kernel_parts, strict=True)
         return joined([block.kernel @ alpha[part] for block, part in pairs])
 
-    # ------------------------------------------------------- rigid bodies' unknowns
-
-    def with_rigid(self, u: Array) -> Array:
-        """Return a displacement of nodes on all unknowns, 0 of rigid bodies, shape ``(n,)``."""
-        return np.append(u, np.zeros(self.size - len(u)))
-
     # ------------------------------------------------------------------- bodies
 
     @property
@@ -230,6 +224,10 @@ class Subdomains:
         return np.ascontiguousarray(found.T)
 
     # ------------------------------------------------------------ displacements
+
+    def with_rigid(self, u: Array) -> Array:
+        """Return a displacement of nodes on all unknowns, 0 of rigid bodies, shape ``(n,)``."""
+        return np.append(u, np.zeros(self.size - len(u)))
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shape ``(n,)``."""
@@ -315,8 +313,8 @@ class FiniteElements:
         """
         return node_blocks(K, self._dofs.bs)[self._dofs.dolfinx_node]
 
-    def load(self, forms: Forms) -> Array:
-        """Return this rank's load in DOLFINx's numbering."""
+    def load(self, forms: Forms) -> Load:
+        """Return this rank's load."""
         return forms.load()
 
     def solved(self, u: Array) -> Any:
