@@ -104,10 +104,9 @@ def test_what_does_not_converge_is_named_with_its_time(raises):
 
 def test_going_back():
     scene = Repeated("triangle")
-    with pytest.raises(tfeti.InputError, match="there is no solution yet"):
-        scene.problem.accept()
-    with pytest.raises(tfeti.InputError, match="there is no state yet"):
-        scene.problem.state()
+    for call, what in ((scene.problem.accept, "solution"), (scene.problem.state, "state")):
+        with pytest.raises(tfeti.InputError, match=f"there is no {what} yet"):
+            call()
     first = scene.solve()
     scene.problem.accept()
     scene.solve(load=-0.08)

@@ -79,16 +79,18 @@ def test_a_report_that_cannot_be_written_is_named_on_all_ranks(report, comm, sha
 
 
 def test_after_an_error_the_report_says_what_is_known():
-    d = decomposed("hexahedron", 2, 3)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))
-    p = problem(d, (0, 0, 0.05), [floor], clamped=())
+    p = problem(decomposed("hexahedron", 2, 3), (0, 0, 0.05), [floor])
     assert p.report.converged_reason == "NOT_SOLVED"
+    p.solve()
+    p.update(values=[])
     with pytest.raises(tfeti.NoSolutionError):
         p.solve()
+    with pytest.raises(tfeti.InputError, match="the last solve has not converged"):
+        p.accept()
     assert p.report.converged_reason == "NO_SOLUTION"
-    assert p.report.contact_candidates == 9
+    assert (p.report.contact_candidates, p.report.active_contacts) == (9, 0)
     assert p.report.primal_dofs > 81
-    assert p.report.active_contacts == 0
 
 
 def test_a_solve_that_stopped_early_says_how_wrong_it_is():

@@ -37,9 +37,7 @@ def top(gdim, height=1.0):
 
 def ball(gdim, radius=1.0, offset=0.0):
     """Ball that touches the top, beside the middle."""
-    centre = np.full(gdim, 0.5)
-    centre[0], centre[-1] = 0.5 + offset, 1.0 + radius
-    return tfeti.Sphere(centre, radius)
+    return tfeti.Sphere(np.array([0.5 + offset, *[0.5] * (gdim - 2), 1.0 + radius]), radius)
 
 
 def solved(scene, *contacts, **options):
@@ -89,8 +87,7 @@ def test_a_force_moves_a_tool_as_far_as_its_displacement_has_needed(gdim, fricti
     by_law = solved(scene, law)
     rounding = 1e-18  # as a vector has that was turned
     force = np.where(way != 0.0, -by_law.solution.tool("ball").resultant.force, rounding)
-    axis = "xyz"[gdim - 1]
-    pressed = tfeti.RigidBody(ball(gdim), force=force, free=(axis,), name="ball")
+    pressed = tfeti.RigidBody(ball(gdim), force=force, free=("xyz"[gdim - 1],), name="ball")
     by_force = solved(scene, tfeti.Obstacle("top", pressed, friction=friction))
     assert same(by_law, by_force)
     assert np.allclose(by_force.solution.tool("ball").displacement, way, rtol=1e-8)
@@ -108,14 +105,11 @@ def test_an_eccentric_force_tilts_a_punch_as_in_closed_form(gdim):
     """
     scene = block(gdim, degree=2, n=8 if gdim == 2 else 4, hold=held, nu=0.0)
     force, e = 0.02, 0.1
-    at = np.full(gdim, 0.5)
-    at[-1] = 1.0
-    at[0] += e
+    at = np.array([0.5 + e, *[0.5] * (gdim - 2), 1.0])
     free = ("y", "rz") if gdim == 2 else ("z", "rx", "ry")
     punch = tfeti.RigidBody(top(gdim), force=force * DOWN[gdim], free=free, point=at, name="punch")
     problem = solved(scene, tfeti.Obstacle("top", punch))
-    b = 12.0 * force * e
-    tool = problem.solution.tool("punch")
+    b, tool = 12.0 * force * e, problem.solution.tool("punch")
     angle = tool.rotation[2] if gdim == 2 else -tool.rotation[1]
     assert np.isclose(angle, -b, rtol=1e-3 if gdim == 2 else 4e-3)  # of u_z = −(F + bx)z
     assert np.isclose(tool.displacement[-1], -force - b * e, rtol=1e-3)
@@ -146,25 +140,31 @@ def test_one_tool_on_two_surfaces_has_the_statics_of_a_beam():
     shapes = tfeti.SignedDistance(lambda x: np.linalg.norm(way(x), axis=0) - 0.5, way)
     bridge = tfeti.RigidBody(shapes, force=(0, -0.01), free=("y", "rz"), point=(0.25, 1.0))
     data = solved(scene, tfeti.Obstacle("top", bridge)).solution.contact(0)
-    left = data.points[:, 0] < 0.5
-    comm = scene["decomposition"].comm
+    left, comm = data.points[:, 0] < 0.5, scene["decomposition"].comm
     forces = [comm.allreduce(float(data.force[side].sum())) for side in (left, ~left)]
     (x, y), (right, up) = (data.points[:, :2] - (0.25, 1.0)).T, data.force * data.normal.T
     assert abs(comm.allreduce(float(np.sum(x * up - y * right)))) <= 1e-11
     assert 2.5 <= forces[0] / forces[1] <= 3.5
 
 
-@pytest.mark.parametrize(
-    ("tool", "words"),
-    [
-        ({"force": (0, 1.0), "free": ("y",)}, "translation in y"),
-        ({"force": (0.1, -1.0), "free": ("x", "y")}, "translation in x"),
-        ({"moment": -1.0, "free": ("rz",), "point": (9.0, 1.0)}, "rotation in the plane"),
-    ],
-)
-def test_a_tool_that_nothing_balances_is_named(tool, words):
-    with pytest.raises(tfeti.NoSolutionError, match=f"punch.*{words}"):
-        solved(block(2, n=3), tfeti.Obstacle("top", tfeti.RigidBody(top(2), name="punch", **tool)))
+def test_a_tool_that_nothing_balances_is_named():
+    for words, law in (
+        ("translation in y", {"force": (0, 1.0), "free": ("y",)}),
+        ("translation in x", {"force": (0.1, -1.0), "free": ("x", "y")}),
+        ("rotation in the plane", {"moment": -1.0, "free": ("rz",), "point": (9.0, 1.0)}),
+    ):
+        tool = tfeti.RigidBody(top(2), name="punch", **law)
+        with pytest.raises(tfeti.NoSolutionError, match=f"punch.*{words}"):
+            solved(block(2, n=3), tfeti.Obstacle("top", tool))
+
+
+@pytest.mark.parametrize("law", [ROUGH, tfeti.Tresca(0.03)])
+def test_a_free_tool_rubs_on_nodes_that_are_held_along_the_surface(law):
+    """Friction of the others alone would not hold it."""
+    scene, force = block(2, n=4, hold=lambda d, side: held(d, side, "left")), (0.028, -0.1)
+    tool = tfeti.RigidBody(top(2), force=force, free=("x", "y"))
+    found = solved(scene, tfeti.Obstacle("top", tool, friction=law)).solution.tool(0)
+    assert np.allclose(found.resultant.force, np.negative(force), rtol=0, atol=1e-10)
 
 
 def test_motions_that_nothing_resists_or_drives_are_free():

@@ -198,10 +198,9 @@ def block_on_floor(scale, E, load, subdomains=2):
 @pytest.mark.parametrize(("scale", "E"), [(1e-9, 2e11), (1e6, 2e-1)])
 def test_units_do_not_matter(scale, E):
     assert solved(block_on_floor(scale, E, (0.0, -1e-3))).report.free_modes == 1
-    with pytest.raises(NoSolutionError, match=r"translation in y\): only contact"):
-        block_on_floor(scale, E, (0.0, 1e-3)).solve()
-    with pytest.raises(NoSolutionError, match=r"translation in x\): nothing resists"):
-        block_on_floor(scale, E, (1e-9, -1e-3)).solve()
+    for load, says in (((0.0, 1e-3), "y.: only contact"), ((1e-9, -1e-3), "x.: nothing resists")):
+        with pytest.raises(NoSolutionError, match=f"translation in {says}"):
+            block_on_floor(scale, E, load).solve()
 
 
 def test_springs_of_1e_10_hold_a_body():

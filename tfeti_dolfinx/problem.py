@@ -225,6 +225,7 @@ class ContactProblem:
                 self._system.know_rows(rows)
             if isinstance(error, NoSolutionError):
                 self._outcome = replace(self._outcome, converged_reason="NO_SOLUTION")
+            self._start = None  # what was found before is no end of this load step
             self._compose_report()
             raise
         self._compose_report()
@@ -454,7 +455,7 @@ class ContactProblem:
         Friction acts on slips from there on (quasi-static), and ``go_back`` returns there.
 
         Raises:
-            InputError: There is no solution, or the solver stopped before its tolerance.
+            InputError: There is no solution, or the last solve has raised an error.
         """
         with agreeing(self.decomposition.comm, "accept"):
             solution, start = self.solution, self._start

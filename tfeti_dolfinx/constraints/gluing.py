@@ -55,7 +55,7 @@ class RowBuilder:
             self.across = np.any(along > 1.0 - TOLERANCES.nothing_left, axis=2)
 
     def left(self, axis: int) -> tuple[Array, Array, Array]:
-        """Squared norms in D⁻¹ without prescribed components; whether they exceed rounding.
+        """Squared norms in D⁻¹, with and without prescribed components.
 
         And the share of Σ_j |a_ij| along the axis that is not prescribed, free motions of rigid
         bodies included, which does not depend on stiffnesses. Shapes ``(n,)``.
@@ -67,7 +67,7 @@ class RowBuilder:
         for of in moduli:
             np.add.at(of, self._rigid.condition, np.abs(of_rigid))
         share = moduli[1] / np.maximum(moduli[0], TINY)
-        return after, after > TOLERANCES.nothing_left**2 * before, share
+        return before, after, share
 
     def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
         """Return a row for each of these conditions along an axis, times its scale."""
@@ -110,7 +110,8 @@ def contact_rows(dofs: TornDofs, builder: RowBuilder) -> tuple[Rows, Rows, Conta
     bound. Under Coulomb's law it has none: the pressure is hidden in what holds the node.
     """
     records, count = builder.records, dofs.bs - 1
-    squares, left, _ = builder.left(0)
+    before, squares, _ = builder.left(0)
+    left = squares > TOLERANCES.nothing_left**2 * before
     own = np.flatnonzero(records.within_reach & left)
     decided, scale = np.flatnonzero(records.within_reach & ~left), 1.0 / np.sqrt(squares[own])
     normals = builder.rows(0, own, scale)
@@ -120,16 +121,16 @@ def contact_rows(dofs: TornDofs, builder: RowBuilder) -> tuple[Rows, Rows, Conta
         contact = ContactRows(own, none, decided, scale, number, none, moves)
         return normals, Rows(none, none, none, number), contact
     of_axes = [builder.left(1 + k) for k in range(count)]
-    squares, left, share = np.array(of_axes).transpose(1, 2, 0)
-    left = left * (share > TOLERANCES.little_left) * ~builder.across
+    squares, _, share = np.array(of_axes).transpose(1, 2, 0)
+    left = (share > TOLERANCES.little_left) & ~builder.across
     of_normal, row = np.zeros(len(records)), np.full(len(records), -1)
     of_normal[own], row[own] = scale, np.arange(len(own))
     row[records.friction != Friction.COULOMB] = -1
     rubs = (records.friction == Friction.GIVEN) & records.within_reach
     rubs |= (records.friction == Friction.COULOMB) & (of_normal > 0.0)
-    points = np.flatnonzero(rubs & np.any(left > 0.0, axis=1))
+    points = np.flatnonzero(rubs & np.any(left, axis=1))
     longest = np.sqrt(squares[points].max(axis=1, initial=0.0))
-    over, moves = of_normal[points], left[points] > 0.0
+    over, moves = of_normal[points], left[points]
     over = np.where(over > 0.0, over, 1.0 / np.maximum(longest, TINY))
     rows = stack([builder.rows(1 + k, points, over * moves[:, k]) for k in range(count)])
     # those of a condition one after the other

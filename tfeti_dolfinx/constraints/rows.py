@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 class RowTolerances:
     """Tolerances of rows."""
 
-    # of a row's norm: if prescribed components leave less, rounding of the normal has made it
+    # of a normal row's norm: if prescribed components leave less, rounding of the normal made it
     # (ε|x|/h of a facet of size h at x), and the row is dropped
     nothing_left: float = 1e-6
     # of Σ_j |a_ij| of a tangential row: if prescribed components leave less, it is dropped. On a

@@ -199,7 +199,6 @@ class NonlinearContactProblem(ContactProblem):
             self._system.change("stiffness")
             self._set(begin)
             self._system.tools.go_back()
-            self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:
             self.options = self._settings.options
