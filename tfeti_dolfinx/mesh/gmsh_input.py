@@ -369,7 +369,7 @@ def untorn_mesh(
     all_x = np.concatenate([np.empty((0, 3)), *(content.x for content in with_cells)])
     node_ids, first = np.unique(all_ids, return_index=True)
     order = cell_permutation(cell_type, found.nodes.shape[1])
-    cells = np.searchsorted(node_ids, found.nodes[:, order])
+    cells = places(node_ids, found.nodes[:, order])
     mesh = UntornMesh(
         cell_type=cell_type,
         element=element,
@@ -392,6 +392,21 @@ def untorn_mesh(
         check_shared(mesh, all_ids, all_x, float(sides.max()), comm)
     partitioned = comm.allreduce(bool(np.all(found.partitions >= 0)), op=MPI.LAND)
     return mesh, found.partitions if partitioned else None
+
+
+def places(known: Array, ids: Array, wide: int = 4) -> Array:
+    """Return where ids stand among those known, which ascend and have them all.
+
+    Where most numbers in between are known, a table of them all says it; else a search, since the
+    table might be ``wide`` times as long as what this rank has, or more.
+    """
+    least = int(known[0]) if len(known) else 0
+    width = int(known[-1]) - least + 1 if len(known) else 0
+    if width > wide * len(known):
+        return np.searchsorted(known, ids)
+    table = np.zeros(width, dtype=np.int64)
+    table[known - least] = np.arange(len(known))
+    return table[ids - least]
 
 
 def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> str:
