@@ -196,14 +196,14 @@ LIMITS = WarningLimits()
 class Diagnostics:
     """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
 
-    ``may_lock``: displacements have degree 1, and the law is not selective; ``flowing``: from laws,
-    the cells of this rank in which plastic flow is most of the strain.
+    ``may_lock``: displacements have degree 1, and the law is not selective; ``flowing_cells``:
+    from laws, those of this rank in which plastic flow is most of the strain.
     """
 
     def __init__(self, dofs: TornDofs) -> None:
         self._decomposition, self._dofs = dofs.decomposition, dofs
         self.may_lock = dofs.V.element.basix_element.degree == 1
-        self.flowing: list[Callable[[], Array]] = []
+        self.flowing_cells: list[Callable[[], Array]] = []
         self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
         self._locks = np.zeros(0, dtype=bool)  # which bodies lock whatever flows
@@ -292,9 +292,9 @@ class Diagnostics:
 
     def _flow(self) -> Iterator[str]:
         """Displacements of degree 1 where plastic flow keeps the volume."""
-        if not (self.may_lock and self.flowing):
+        if not (self.may_lock and self.flowing_cells):
             return
-        d, cells = self._decomposition, np.concatenate([cells() for cells in self.flowing])
+        d, cells = self._decomposition, np.concatenate([of() for of in self.flowing_cells])
         own = np.zeros(d.num_bodies)
         own[d.body_of_subdomain[d.cell_subdomain[cells]]] = 1.0
         if np.any(flows := maxima(d.comm, own) > self._locks[: d.num_bodies]):

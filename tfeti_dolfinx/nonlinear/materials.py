@@ -321,7 +321,7 @@ class Plasticity(Material):
     def _accumulated(self) -> Array:
         """Return p at the end of the load step, at all quadrature points."""
 
-    def flowing(self) -> Array:
+    def flowing_cells(self) -> Array:
         """Return this rank's cells in which plastic flow is most of the strain. Collective."""
         far = self._tolerances.flows * self._values_of(self._strain_of_yielding)
         flows = np.zeros(len(self._value.x.array), dtype=bool)

@@ -167,7 +167,8 @@ class NonlinearContactProblem(ContactProblem):
         self._exact = self.options.number
         locking = [law for law in laws if not law.selective]
         self._diagnostics.may_lock &= not laws or bool(locking)
-        self._diagnostics.flowing = [law.flowing for law in locking if isinstance(law, Plasticity)]
+        plastic = [law for law in locking if isinstance(law, Plasticity)]
+        self._diagnostics.flowing_cells = [law.flowing_cells for law in plastic]
         self._system.is_tangent = True
         self._begin = self._first
         self._system.begin_at(self.dofs.to_primal(self._begin))

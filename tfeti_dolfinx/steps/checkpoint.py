@@ -140,8 +140,12 @@ class Checkpoint:
                 lines = file.read_bytes().splitlines(keepends=True)[: self._index.number]
                 if len(lines) < self._index.number:
                     raise damaged(file, INDEX)
-                found = [_unsealed(line, file, "it") for line in lines]
+                found = [_unsealed(line, file) for line in lines]
                 kept = [Kept(**record.pop("kept"), record=record) for record in found]
+                for step in kept[:-1]:  # whose states are gone
+                    step.states.clear()
+                    if not step.fields:
+                        step.subdomains.clear()
                 os.truncate(file, sum(len(line) for line in lines))  # what lies beyond goes
                 for file in self.path.iterdir():
                     if self._index.owns(file) and not self._index.counts(file):
@@ -291,7 +295,7 @@ class Checkpoint:
                 f"{file} is not that of a checkpoint, or damaged; expected the folder as it was "
                 "left, or another one"
             )
-        found = _unsealed(text, file, "it")
+        found = _unsealed(text, file)
         if found["version"] != VERSION:
             raise InputError(f"{file} is of version {found['version']}; expected {VERSION}")
         return Index(**found)
@@ -327,14 +331,14 @@ def _sealed(content: Mapping[str, Any]) -> bytes:
     return f"{json.dumps({**content, 'checksum': checksum})}\n".encode()
 
 
-def _unsealed(line: bytes, file: Path, where: str) -> dict[str, Any]:
+def _unsealed(line: bytes, file: Path) -> dict[str, Any]:
     """Return the content of a line that ``_sealed`` has made; raise if the file is damaged."""
     with suppress(ValueError, RecursionError, AttributeError, KeyError, TypeError):
         found: dict[str, Any] = json.loads(line)
         checksum = found.pop("checksum")
         if checksum == _hash(json.dumps(found).encode()).hexdigest():
             return found
-    raise damaged(file, where)
+    raise damaged(file, "it")
 
 
 def _settle(file: BinaryIO) -> None:
