@@ -77,8 +77,8 @@ def test_a_prescribed_tangent_leaves_a_row_without_entries(value):
     assert held.count(~rows.moves) == 3
     along_x = np.abs(held.records.tangents[rows.points, :, 0]) > 0.5
     assert np.array_equal(~rows.moves, along_x & on_left[:, None])
-    held.gluing.bound_friction(np.full((len(held.records), 2), 0.5), held.records.area)
-    bound = held.gluing.constraints.limits
+    halves = np.full((len(held.records), 2), 0.5)
+    bound = held.gluing.with_friction(halves, held.records.area).constraints.limits
     assert np.all((bound > 0.0) == (rows.moves | (value > 0.0)))
     expected = 0.5 * held.records.area[rows.points] / rows.tangent_scale
     assert np.allclose(bound.max(axis=1, initial=0.0), expected)

@@ -93,7 +93,7 @@ def estimate(
 
     Its outcome has them then, too, with a warning where they are of no use.
     """
-    if solution.gluing.constraints is not system.gluing.constraints:
+    if solution.gluing.constraints.B is not system.gluing.constraints.B:
         raise InputError(
             "estimate: the constraints are not those of the solution; expected a call after solve()"
         )

@@ -352,14 +352,14 @@ class System(Generic[OwnForms]):
             self.change("friction")
 
     def _set_friction_limits(self) -> None:
-        """Fill areas of the rows, the ψ_i, and the μ_i under Coulomb's law."""
+        """Give the rows their areas, the ψ_i, and the μ_i under Coulomb's law."""
         if not self._has_friction and self._settings.extensions.feasible_set is contact_set:
             return
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
         area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
         friction = made(self.known_friction) if self._has_friction else np.zeros(gluing.slip.shape)
-        gluing.bound_friction(friction, area)
+        self._gluing = gluing.with_friction(friction, area)
 
     def _assemble_load(self) -> None:
         self._load = self.elements.load(self.forms)
@@ -462,7 +462,7 @@ STAGES: dict[str, tuple[str, Callable[[System[Forms]], None]]] = {
     "factors": ("factors", System._factor),
     "trace": ("factors", lambda system: system.subdomains.retrace(system.gluing.constraints.trace)),
     "coarse problem": ("coarse", System._make_dual),
-    "linear term": ("coarse", lambda system: system.dual.update_load()),
+    "linear term": ("coarse", lambda system: system.dual.update_load(system.gluing.constraints)),
 }
 # what has to be made anew where something has changed
 CHANGES = {

@@ -240,8 +240,8 @@ class Gluing:
             c[sets.tangents] = np.where(slides, slips * rows.tangent_scale[:, None], 0.0)
         return c
 
-    def bound_friction(self, values: Array, area: Array) -> None:
-        """Fill ∫φ_i of the rows, the ψ_i = traction · ∫φ_i / s_i, and the μ_i of Coulomb's law.
+    def with_friction(self, values: Array, area: Array) -> Gluing:
+        """The same rows with ∫φ_i, ψ_i = traction · ∫φ_i / s_i, and the μ_i of Coulomb's law.
 
         Of a point ψ_i or μ_i is 0, and both where nothing can slip. Tractions or coefficients,
         ``(n, gdim - 1)``, and areas ∫φ_i, ``(n,)``, are those of all conditions.
@@ -250,9 +250,13 @@ class Gluing:
         own, given = values[rows.points], (rows.pressed_by < 0)[:, None]
         over = (area[rows.points] / rows.tangent_scale)[:, None]
         slides = rows.moves | self.drawn
-        constraints.area[:] = area[rows.normals]
-        constraints.limits[:] = np.where(slides & given, own * over, 0.0)
-        constraints.coefficients[:] = np.where(slides & ~given, own, 0.0)
+        bounded = replace(
+            constraints,
+            area=area[rows.normals],
+            limits=np.where(slides & given, own * over, 0.0),
+            coefficients=np.where(slides & ~given, own, 0.0),
+        )
+        return replace(self, constraints=bounded)
 
     def closed(self) -> Array:
         """Return the conditions that prescribed components decide and that touch. Collective."""
@@ -291,13 +295,11 @@ class Gluing:
     def with_right_side(
         self, values: Array, gaps: Array, begin: tuple[Array, Array] | None = None
     ) -> Gluing:
-        """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.
+        """The same rows with c of other prescribed values, gaps and slips. Collective.
 
         Values are of owned groups, shape ``(g, bs)``, and have no effect on components that are not
         prescribed; gaps, lengths, of the conditions; slips where the step begins are those of all
-        components, and of prescribed ones alone, default the attribute. The constraints are shared
-        with these rows: their c is the new one too. What raises, as ``right_side`` says, leaves it
-        as it was.
+        components, and of prescribed ones alone, default the attribute. B is shared.
         """
         flag, slip = self.prescribed.flag, self.slip
         if begin is not None:
@@ -309,8 +311,7 @@ class Gluing:
             slip=slip,
         )
         gluing = replace(gluing, drawn=gluing._drawn())
-        self.constraints.c[:] = gluing.right_side()
-        return gluing
+        return replace(gluing, constraints=replace(self.constraints, c=gluing.right_side()))
 
     def _drawn(self) -> Array:
         """Return ``drawn``: slips that are more than rounding. Collective."""
@@ -328,7 +329,7 @@ class Gluing:
 
         Where other components are prescribed all rows of equalities are. Collective.
         """
-        if earlier.constraints is self.constraints:
+        if earlier.constraints.B is self.constraints.B:
             return np.array(lam)
         sets, before = self.constraints.sets, earlier.constraints.sets
         start = np.zeros(self.constraints.num_rows)

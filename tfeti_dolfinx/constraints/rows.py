@@ -130,11 +130,11 @@ class Constraints:
     """B u = c on equality rows, B u ≤ c on rows of contact normals; tangents have friction.
 
     B acts on *trace* unknowns only: primal unknowns that some row touches, sorted as the primal
-    ones. It depends neither on prescribed values nor on gaps; c does, and can be filled again.
+    ones. It depends neither on prescribed values nor on gaps; c does.
     """
 
     B: PETSc.Mat  # dual rows × trace unknowns, MPIAIJ
-    c: Array  # right sides of this rank's rows; 0 until they are set
+    c: Array  # right sides of this rank's rows
     sets: RowSets  # which local rows are what
     trace: Array  # local primal unknown of each local trace unknown, ascending
     # D on the local trace unknowns: the rows are scaled with it. Of rigid bodies it is infinite,
@@ -144,9 +144,7 @@ class Constraints:
     # ∫φ_i of the conditions of normals, times the thickness; 0 without friction, and a set of one's
     # own
     area: Array
-    # the ψ_i, semi-axes of the sets of the tangential multipliers, shape (t, gdim - 1); 0 until
-    # they are set
-    limits: Array
+    limits: Array  # the ψ_i, semi-axes of the sets of the tangential multipliers, (t, gdim - 1)
     coefficients: Array  # the μ_i of Coulomb's law, else 0, shape (t, gdim - 1)
 
     @property

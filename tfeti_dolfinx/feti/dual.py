@@ -168,12 +168,13 @@ class Dual:
         self._held_load: Array | None = None
         self._check_solvable()
 
-    def update_load(self) -> None:
-        """Take the Blocks' present loads and the present right sides.
+    def update_load(self, constraints: Constraints) -> None:
+        """Take the Blocks' present loads, and the same rows with right sides and friction of now.
 
         Raise an InputError where squares of load or values leave the range of floating point; a
         NoSolutionError where the load moves a body that nothing holds.
         """
+        self.constraints = self._given = constraints
         self._set_linear_term(self.coarse.comm)
         self.coarse.update_load()
         self._check_solvable()

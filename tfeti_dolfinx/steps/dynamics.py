@@ -143,7 +143,7 @@ class Predictor:
         if self.rows_and_start is None or self._dual is None:
             return np.zeros(0), np.zeros(0)
         before, lam = self.rows_and_start
-        if before.constraints is not gluing.constraints:
+        if before.constraints.B is not gluing.constraints.B:
             return gluing.multipliers(before, lam), np.zeros(0)
         return lam, self._dual.last.multiple(self._dofs.comm, lam)
 
@@ -151,57 +151,50 @@ class Predictor:
         """Return the nearest displacement to w; free rigid bodies drift to where theirs is.
 
         w is in DOLFINx's order, as is this rank's mass M, whose factors are kept while it is the
-        same object; right sides of the rows are as before afterwards.
+        same object.
         """
         bodies = tools.of_mass_alone() if tools.num_unknowns else tools
-        dofs, settings, constraints = self._dofs, self._settings, gluing.constraints
-        before, f = np.array(constraints.c), M @ w
+        dofs, settings, sets, f = self._dofs, self._settings, gluing.constraints.sets, M @ w
+        c = np.array(gluing.constraints.c)
         values = mean_of_copies(dofs, dofs.to_primal(w)).ravel()
-        constraints.c[constraints.sets.equalities] = gluing.to_equalities @ values
-        try:
-            # 1. what is out of date
-            if M is not self._M:
-                self.destroy()
-                data = subdomain_data(dofs, M, f, constraints.trace)
-                equals = EqualSubdomains(settings.inverse_factory())
-                self._subdomains = settings.make_subdomains(data, dofs, equals, bodies)
-                self._M = M
-            assert self._subdomains is not None
-            own = bodies.load[: bodies.num_local]
-            self._subdomains.update(f=np.append(dofs.to_primal(f), own))
-            if self._dual is not None and self._dual.constraints is constraints:
-                self._dual.update_load()
-            else:
-                if self._dual is not None:
-                    self._dual.destroy()
-                self._subdomains.retrace(constraints.trace)
-                self._dual, self._options = settings.make_dual(
-                    constraints,
-                    self._subdomains,
-                    dofs,
-                    # without friction
-                    lambda rows: contact_set(replace(rows, limits=0.0 * rows.limits)),
-                )
-            # 2. the program, from the last multipliers on
-            dual, options, start = self._dual, self._options, None
-            dual.begin_solve()
-            if self.rows_and_start is not None:  # nothing has a kernel in M
-                start = (gluing.multipliers(*self.rows_and_start), np.zeros(0))
-                if self.rows_and_start[0] is gluing:
-                    dual.know(self.rows_and_start[1], self.image)
-            self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
-            result, accuracy = solve_dual(dual, options, start)
-            self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
-            self.last = result.lam.copy(), result.face
-            self.multiplications = dual.F.count
-            conclude(result, accuracy, options, dofs.comm)
-            nodal = self._subdomains.num_nodal
-            if tools.num_unknowns:
-                bodies.take(accuracy.u[nodal:])
-                tools.predicted_increment = bodies.increment()
-            return dofs.to_dolfinx(accuracy.u[:nodal])
-        finally:
-            constraints.c[:] = before
+        c[sets.equalities] = gluing.to_equalities @ values
+        rows = replace(gluing.constraints, c=c, limits=np.zeros(sets.tangents.shape))
+        # 1. what is out of date
+        if M is not self._M:
+            self.destroy()
+            data = subdomain_data(dofs, M, f, rows.trace)
+            equals = EqualSubdomains(settings.inverse_factory())
+            self._subdomains = settings.make_subdomains(data, dofs, equals, bodies)
+            self._M = M
+        assert self._subdomains is not None
+        own = bodies.load[: bodies.num_local]
+        self._subdomains.update(f=np.append(dofs.to_primal(f), own))
+        if self._dual is not None and self._dual.constraints.B is rows.B:
+            self._dual.update_load(rows)
+        else:
+            if self._dual is not None:
+                self._dual.destroy()
+            self._subdomains.retrace(rows.trace)
+            made = settings.make_dual(rows, self._subdomains, dofs, contact_set)
+            self._dual, self._options = made
+        # 2. the program, from the last multipliers on
+        dual, options, start = self._dual, self._options, None
+        dual.begin_solve()
+        if self.rows_and_start is not None:  # nothing has a kernel in M
+            start = (gluing.multipliers(*self.rows_and_start), np.zeros(0))
+            if self.rows_and_start[0].constraints.B is rows.B:
+                dual.know(self.rows_and_start[1], self.image)
+        self.image = np.zeros(0)  # it is of the F and the start of a restored state alone
+        result, accuracy = solve_dual(dual, options, start)
+        self.rows_and_start = (gluing, result.lam.copy()) if result.reason > 0 else None
+        self.last = result.lam.copy(), result.face
+        self.multiplications = dual.F.count
+        conclude(result, accuracy, options, dofs.comm)
+        nodal = self._subdomains.num_nodal
+        if tools.num_unknowns:
+            bodies.take(accuracy.u[nodal:])
+            tools.predicted_increment = bodies.increment()
+        return dofs.to_dolfinx(accuracy.u[:nodal])
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; the next call makes them anew."""
