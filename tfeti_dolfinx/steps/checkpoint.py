@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -21,7 +21,7 @@ from tfeti_dolfinx.common.validation import PARTIAL, checked_type, named, writte
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table, numbered
 
-INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 11
+INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 12
 KIND = "checkpoint of tfeti_dolfinx"
 COUNTS = " of subdomains"  # behind the name of an array: how many of its rows are of each
 _hash: Any = functools.partial(hashlib.blake2b, digest_size=16)
@@ -33,12 +33,16 @@ OF_STEP = re.compile(
 
 @dataclass(frozen=True)
 class Index:
-    """Content of ``checkpoint.json``: the step that counts."""
+    """Content of ``checkpoint.json``: the step that counts, and what a series goes on from."""
 
     number: int  # how many steps have converged; 0: the folder is taken, nothing is kept yet
     ranks: int  # the largest number of ranks that have written here
     kind: str = KIND  # the mark of a folder that a checkpoint owns
     version: int = VERSION  # of this form
+    digest: Any = None  # describes what the user has given
+    about: dict[str, Any] = field(default_factory=dict)  # what else is to be known of the step
+    states: list[str] = field(default_factory=list)  # checksum of the state's file of each rank
+    subdomains: list[list[int]] = field(default_factory=list)  # subdomains of each of these ranks
 
     def owns(self, file: Path) -> bool:
         """Return whether the checkpoint writes a file of this name up to the next step."""
@@ -62,11 +66,9 @@ class Kept:
     """A step in a checkpoint: a line of ``records.jsonl``, the same on all ranks."""
 
     record: dict[str, Any]  # its record
-    digest: Any  # describes what the user has given
-    about: dict[str, Any]  # what else is to be known of it
-    states: list[str]  # checksum of the state's file of each rank
-    fields: list[str]  # of the fields' likewise; empty where none are
-    subdomains: list[list[int]]  # subdomains of each rank, which its files have
+    # checksum of the fields' file of each rank, and its subdomains; empty where there are none
+    fields: list[str] = field(default_factory=list)
+    subdomains: list[list[int]] = field(default_factory=list)
 
 
 class Checkpoint:
@@ -75,10 +77,10 @@ class Checkpoint:
     Each rank writes its arrays to a file of its own, with the number of the step in its name,
     subdomain by subdomain. Another number of ranks reads them: each rank the files that have its
     subdomains. The record of the step is a line at the end of ``records.jsonl``, with the checksums
-    of these files. When all are whole, ``checkpoint.json`` takes that number: it is written aside
-    and renamed, so it names whole files at any time, and a line that is torn lies beyond the lines
-    of so many steps. Then the state of the step before goes. What a step
-    writes does not grow with their number.
+    of its fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of
+    the state: it is written aside and renamed, so it names whole files at any time, and a line that
+    is torn lies beyond the lines of so many steps. Then the state of the step before goes. What a
+    step writes does not grow with their number.
 
     The folder is the checkpoint's own. ``checkpoint.json`` marks it before anything else is
     written; it says of which steps and ranks there are files, and only those are ever removed.
@@ -89,6 +91,9 @@ class Checkpoint:
         path: The folder; it may be there if it is empty or has a checkpoint, and nothing else.
         comm: Communicator.
         subdomains: Those of this rank, ascending.
+
+    Attributes:
+        index: The step that counts; on other ranks than 0 as the last ``read`` has found it.
     """
 
     def __init__(
@@ -97,10 +102,10 @@ class Checkpoint:
         checked_type(path, (str, os.PathLike), "checkpoint", "the name of a folder")
         self.path, self._comm = Path(path), comm
         self._subdomains = [int(s) for s in subdomains]
-        self._index = Index(0, comm.size)  # rank 0's counts
+        self.index = Index(0, comm.size)  # rank 0's counts
         with raised_on_all_ranks(comm), named(f"checkpoint {self.path}", OSError):
             if comm.rank == 0:
-                self._index = self._checked_folder()
+                self.index = self._checked_folder()
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -108,7 +113,7 @@ class Checkpoint:
         lock = None
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
             if self._comm.rank == 0:
-                self._index = self._checked_folder()
+                self.index = self._checked_folder()
                 self.path.mkdir(parents=True, exist_ok=True)
                 lock = _lock(self.path)
         try:
@@ -121,9 +126,9 @@ class Checkpoint:
         """Remove what an earlier series has left, and take the folder, which is locked."""
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
             if self._comm.rank == 0:
-                self._commit(self._index)  # on a full disk nothing goes
+                self._commit(self.index)  # on a full disk nothing goes
                 for file in self.path.iterdir():
-                    if self._index.owns(file) and file.name != INDEX:
+                    if self.index.owns(file) and file.name != INDEX:
                         file.unlink()
                 self._commit(Index(0, self._comm.size))  # until here it says what is to go
 
@@ -135,24 +140,21 @@ class Checkpoint:
         """
         kept: list[Kept] = []
         with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
-            if self._comm.rank == 0 and self._index.number:
+            if self._comm.rank == 0 and self.index.number:
                 file = self.path / RECORDS
-                lines = file.read_bytes().splitlines(keepends=True)[: self._index.number]
-                if len(lines) < self._index.number:
+                lines = file.read_bytes().splitlines(keepends=True)[: self.index.number]
+                if len(lines) < self.index.number:
                     raise damaged(file, INDEX)
                 found = [_unsealed(line, file) for line in lines]
                 kept = [Kept(**record.pop("kept"), record=record) for record in found]
-                for step in kept[:-1]:  # whose states are gone
-                    step.states.clear()
-                    if not step.fields:
-                        step.subdomains.clear()
                 os.truncate(file, sum(len(line) for line in lines))  # what lies beyond goes
                 for file in self.path.iterdir():
-                    if self._index.owns(file) and not self._index.counts(file):
+                    if self.index.owns(file) and not self.index.counts(file):
                         file.unlink()
-                if self._index.ranks < self._comm.size:  # before files of more ranks come
-                    self._commit(replace(self._index, ranks=self._comm.size))
-        return self._comm.bcast(kept, root=0)
+                if self.index.ranks < self._comm.size:  # before files of more ranks come
+                    self._commit(replace(self.index, ranks=self._comm.size))
+        self.index, kept = self._comm.bcast((self.index, kept), root=0)
+        return kept
 
     def write(
         self,
@@ -177,19 +179,20 @@ class Checkpoint:
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
             if checksums is not None:  # on rank 0
                 states, of_fields, parts = (list(c) for c in zip(*checksums, strict=True))
-                before, kept = self._index, {"digest": digest, "about": about, "states": states}
-                kept |= {"fields": of_fields if fields else [], "subdomains": parts}
+                before = self.index
+                kept = {"fields": of_fields, "subdomains": parts} if fields else {}
                 with (self.path / RECORDS).open("ab") as file:
                     file.write(_sealed({**record, "kept": kept}))
                     _settle(file)
-                self._commit(Index(number, max(before.ranks, comm.size)))
+                now = Index(number, max(before.ranks, comm.size), digest=digest, about=dict(about))
+                self._commit(replace(now, states=states, subdomains=parts))
                 for rank in range(before.ranks):
                     (self.path / f"state_{before.number}_{rank}.npz").unlink(missing_ok=True)
 
-    def read_state(self, kept: list[Kept]) -> SavedState:
+    def read_state(self) -> SavedState:
         """Return the state of this rank at the last step that ``read`` found."""
-        last = kept[-1]
-        table = self._load("state", len(kept), last.states, last.subdomains)
+        last = self.index
+        table = self._load("state", last.number, last.states, last.subdomains)
         state = SavedState.from_table(table)
         own = last.subdomains[self._comm.rank] if self._comm.rank < len(last.states) else []
         same = self._comm.size == len(last.states) and own == self._subdomains
@@ -239,7 +242,7 @@ class Checkpoint:
                 file = self.path / f"{kind}_{number}_{rank}.npz"
                 with named(f"cannot read {file}", OSError):
                     if _hash(file.read_bytes()).hexdigest() != checksums[rank]:
-                        raise damaged(file, RECORDS)
+                        raise damaged(file, INDEX if kind == "state" else RECORDS)
                     with np.load(file) as contents:
                         found[rank] = dict(contents)
         table: Table = {}
@@ -261,7 +264,7 @@ class Checkpoint:
         with written_whole(self.path / INDEX) as partial, partial.open("wb") as file:
             file.write(_sealed(asdict(index)))
             _settle(file)
-        self._index = index
+        self.index = index
 
     def _checked_folder(self) -> Index:
         """Return the index of the folder, or one of nothing; raise where there is anything else."""

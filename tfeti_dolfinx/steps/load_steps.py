@@ -430,7 +430,7 @@ class LoadSteps:
         if not kept:
             checkpoint.forget()
             return Place()
-        about = kept[-1].about
+        about = checkpoint.index.about
         place = Place(**about["place"])
         records = [StepRecord(**step.record) for step in kept]
         ends = {record.number: record.time for record in records}
@@ -448,8 +448,8 @@ class LoadSteps:
         self._set(records[-1].time)
         digest = self._problem.digest()
         with raised_on_all_ranks(self._comm):
-            check_same_problem(kept[-1].digest, digest)
-        self._problem.restore(checkpoint.read_state(kept))
+            check_same_problem(checkpoint.index.digest, digest)
+        self._problem.restore(checkpoint.read_state())
         self.records = records
         if self._path is not None:  # a file of ADIOS2 cannot be continued
             try:
