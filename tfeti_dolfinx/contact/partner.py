@@ -102,7 +102,7 @@ class ContactPartner(ABC):
         return float(reach)
 
     @abstractmethod
-    def settled(
+    def with_sides(
         self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Prescribed
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact with its sides decided, and its conditions up to a reach, and so deep.
@@ -260,7 +260,7 @@ class Obstacle(ContactPartner):
         """The surface."""
         return (self.surface,)
 
-    def settled(
+    def with_sides(
         self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Prescribed
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact and its conditions. Collective.
@@ -407,7 +407,7 @@ class Contact(ContactPartner):
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
-        """Both surfaces; where the sides are settled, the secondary one first."""
+        """Both surfaces; where the sides are decided, the secondary one first."""
         return self.a, self.b
 
     def first_reach(self, decomposition: Decomposition) -> float:
@@ -421,7 +421,7 @@ class Contact(ContactPartner):
         self._named_first(decomposition)
         return min(reach, diameter(decomposition))
 
-    def settled(
+    def with_sides(
         self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None, held: Prescribed
     ) -> tuple[Contact, ContactRecords]:
         """Return the contact with its secondary side as ``a``, and its conditions. Collective.
@@ -432,27 +432,27 @@ class Contact(ContactPartner):
         the other one covers by little at all nodes is secondary only if both are so.
         """
         cite("mortar")
-        settled = self._named_first(dofs.decomposition)
-        sides = settled._sides(dofs, held)
-        found = settled._meet(sides, dofs, contact, reach, reach, held)
+        chosen = self._named_first(dofs.decomposition)
+        sides = chosen._sides(dofs, held)
+        found = chosen._meet(sides, dofs, contact, reach, reach, held)
         if stiffness is None:
-            return settled, found
+            return chosen, found
         size, per_area = _ratios(found, sides, dofs, stiffness)
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
         exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0
         auto, finite = self.secondary == "auto", dofs.nodes is not None
         cover = _cover(found, dofs)
         if not cover[0] or (auto and (exchange or finite)):
-            other = settled._meet(sides[::-1], dofs, contact, reach, reach, held)
+            other = chosen._meet(sides[::-1], dofs, contact, reach, reach, held)
             of_other = _cover(other, dofs)
             if auto and (of_other, exchange) > (cover, False):
-                settled, found = replace(settled, a=settled.b, b=settled.a), other
+                chosen, found = replace(chosen, a=chosen.b, b=chosen.a), other
             elif not auto and of_other[0] and not cover[0] and dofs.comm.rank == 0:
-                log.warning(LITTLE, self.name, settled.b, settled.a, settled.b)
+                log.warning(LITTLE, self.name, chosen.b, chosen.a, chosen.b)
         worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
         if worse and not auto and dofs.comm.rank == 0:
-            log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
-        return settled, found
+            log.warning(WORSE, self.name, chosen.a, per_area, chosen.b, chosen.b)
+        return chosen, found
 
     def records(
         self, dofs: TornDofs, contact: int, reach: float, depth: float, held: Prescribed

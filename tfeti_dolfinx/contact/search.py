@@ -61,12 +61,12 @@ class ContactSearch:
         self._depths = bcast_from_root(dofs.comm, reach)
         self._reach = list(self._depths)
         check_together(contacts, decomposition)
-        settled = [
-            contact.settled(dofs, i, self._reach[i], stiffness, self._prescribed)
+        found = [
+            contact.with_sides(dofs, i, self._reach[i], stiffness, self._prescribed)
             for i, contact in enumerate(contacts)
         ]
-        self.contacts = [contact for contact, _ in settled]
-        self._records = [self._from_origin(i, records) for i, (_, records) in enumerate(settled)]
+        self.contacts = [contact for contact, _ in found]
+        self._records = [self._from_origin(i, records) for i, (_, records) in enumerate(found)]
         # beside the conditions that they were found with, some up to a larger reach
         self._wide: dict[int, tuple[ContactRecords, ContactRecords, float]] = {}
         self._own_shapes = [

@@ -221,7 +221,7 @@ class Dual:
         """
         if self.late is not None:
             self.late.lumped_for = 0
-            self.late.settle()
+            self.late.make_if_due()
             self._schur = self.late.local
         if self._schur is None:
             made = self.subdomains.local_operator("schur", once=True)

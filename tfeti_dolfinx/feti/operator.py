@@ -183,7 +183,7 @@ class LateDirichlet(DualOperator):
         super().__init__(B, subdomains.local_operator("stiffness"))
         self.lumped_for, self._subdomains = lumped_for, subdomains
 
-    def settle(self) -> None:
+    def make_if_due(self) -> None:
         """Make S where it is time. Collective.
 
         Raise a FactorError where the stiffness inside of a subdomain could not be factored.

@@ -121,12 +121,12 @@ class FacePreconditioner:
         self._diagonal = diagonal
         self._on_all: FaceOperator | None = None
         self._last: tuple[Face, FaceOperator] | None = None
-        self.settle()
+        self.follow()
 
-    def settle(self) -> None:
+    def follow(self) -> None:
         """Follow what the operator on all rows becomes."""
         if isinstance(self.whole, LateDirichlet):
-            self.whole.settle()
+            self.whole.make_if_due()
         if (metric := self.whole.metric) is not self._metric and metric is not None:
             self._metric = metric
             self._smooth_in(metric, self._diagonal)
@@ -239,7 +239,7 @@ class _OnFace:
     def __call__(self, x: Array) -> Array:
         """M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
         on, moves, sizes = self._on_all, self._moves, self._sizes
-        on.settle()
+        on.follow()
         B, w, y = on.whole.B, on.work, on.jumps
         trace, size = w.getLocalSize(), len(on.weights)
         D, none = np.append(on.weights, np.ones(len(moves))), np.zeros(size - trace)

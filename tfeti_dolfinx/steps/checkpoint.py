@@ -183,7 +183,7 @@ class Checkpoint:
                 kept = {"fields": of_fields, "subdomains": parts} if fields else {}
                 with (self.path / RECORDS).open("ab") as file:
                     file.write(_sealed({**record, "kept": kept}))
-                    _settle(file)
+                    _to_disk(file)
                 now = Index(number, max(before.ranks, comm.size), digest=digest, about=dict(about))
                 self._commit(replace(now, states=states, subdomains=parts))
                 for rank in range(before.ranks):
@@ -222,7 +222,7 @@ class Checkpoint:
                 arrays[column + COUNTS] = np.bincount(place, minlength=len(self._subdomains))
         with written_whole(self.path / name) as partial, partial.open("wb") as file:
             np.savez(file, **cast(dict[str, Any], arrays))
-            _settle(file)
+            _to_disk(file)
         return _hash((self.path / name).read_bytes()).hexdigest()
 
     def _load(
@@ -263,7 +263,7 @@ class Checkpoint:
         """Let an index count."""
         with written_whole(self.path / INDEX) as partial, partial.open("wb") as file:
             file.write(_sealed(asdict(index)))
-            _settle(file)
+            _to_disk(file)
         self.index = index
 
     def _checked_folder(self) -> Index:
@@ -344,7 +344,7 @@ def _unsealed(line: bytes, file: Path) -> dict[str, Any]:
     raise damaged(file, "it")
 
 
-def _settle(file: BinaryIO) -> None:
+def _to_disk(file: BinaryIO) -> None:
     """Bring a file to the disk, so that a name that it gets later never has less."""
     file.flush()
     os.fsync(file.fileno())
