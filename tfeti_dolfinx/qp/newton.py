@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -201,7 +202,7 @@ class NewtonIteration:
         halved: The last ‖g^P‖ that was at most half of the ``halved`` before.
         idle: Looks in a row that have found neither q lower nor ‖g^P‖ halved.
         not_halved: Looks in a row that have not found ‖g^P‖ halved.
-        resume: Whether λ is where PCPG has stopped.
+        solved: The solve on a face whose end λ is; None where λ is another point.
         cautious: Whether rows leave as they block, after q rose, or an end did not balance.
     """
 
@@ -213,14 +214,15 @@ class NewtonIteration:
         self.z, self.mu, self.s, self.lam_hat = z, mu, z.g, z.lam
         self.face_hat = qp.feasible.face(z.lam, z.g)
         self.residual, self.halved, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self.idle, self.not_halved, self.resume, self.cautious = 0, 0, False, False
+        self.idle, self.not_halved, self.cautious = 0, 0, False
+        self.solved: FaceSolution | None = None
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
         qp, Gt, z, directions = self.qp, self.coarse.combined, self.z, self.solver.directions
         directions.norm = directions.norm or seen_norm(qp, z, self.parameters.short)
         self.norm = directions.norm or 1.0
-        if self.resume:
+        if self.solved:
             self.mu = self.solver.coarse.coordinates(z.g)
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
         self.s = self.z.g - Gt(self.mu)
@@ -260,8 +262,8 @@ class NewtonIteration:
         along = face.restricted(face.beta)  # along a boundary that is curved
         phi, beta = np.where(face.free, self.s, along), face.beta - along
         free, chopped = self.qp.dot((phi, phi), (beta, beta))
-        if self.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
-            free = self.solver.left**2
+        if self.solved:  # what PCPG has left on the face, and not what ᾱ makes of μ
+            free = self.solved.left**2
         if chopped > self.parameters.gamma**2 * free:
             moved = self.feasible.project(z.lam - beta / self.norm)
             face = self.feasible.face(0.5 * (z.lam + moved), self.s)
@@ -271,40 +273,38 @@ class NewtonIteration:
             early |= (face.status == Status.TOUCHING) & (hat == Status.OPEN)
         if not any_rank(self.qp.coarse.comm, early):
             return z, face
-        self.resume = False
+        self.solved = None
         return Point(self.lam_hat, z.g + self.qp.roughly(self.lam_hat - z.lam)), self.face_hat
 
-    def accept(self, end: Point, feasible: bool) -> bool:
+    def accept(self, solved: FaceSolution) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
 
         That is the end of step 3, the point between where q is least, or the projected
         gradient step or the part of it where q is least.
         """
-        looked = np.isfinite(self.residual)
-        enough = self.parameters.enough * 0.5 / self.norm * self.residual**2 if looked else 0.0
+        z, end, given, looked = self.z, solved.end, self.parameters, np.isfinite(self.residual)
+        enough = given.enough * 0.5 / self.norm * self.residual**2 if looked else 0.0
         # on circles s and λ are both large: their product's rounding hides changes of q; what falls
         # is q without terms that Gλ = e makes constant
-        z, step, image = self.z, end.lam - self.z.lam, end.g - self.z.g
-        hidden, slope, curvature = self.qp.dot(
-            (np.abs(z.lam), np.abs(self.s)), (step, -self.s), (step, image)
-        )
-        double, needed = 2.0 * slope - curvature, enough - self.parameters.hidden * hidden
-        taken = feasible and 0.5 * double >= needed
-        stuck = self.not_halved >= self.parameters.in_part and slope > 0.0
-        self.resume = taken
-        rose = double < -self.parameters.hidden * hidden and self.solver.rounds > 1
-        unbalanced = self.not_halved >= self.parameters.in_part and not feasible
-        early = unbalanced or (rose and self.idle < 2)
-        self.cautious = self.parameters.cautious and early
-        if taken:
-            self._go(end, 0.5 * double)
-        elif stuck and feasible and slope < curvature and 0.5 * slope**2 >= needed * curvature:
-            # all of the step is in Ω, which is convex; q is least here
-            t, taken = slope / curvature, True
+        step, image, sizes = end.lam - z.lam, end.g - z.g, (np.abs(z.lam), np.abs(self.s))
+        product, slope, curvature = self.qp.dot(sizes, (step, -self.s), (step, image))
+        hidden = given.hidden * product
+        gain, needed = slope - 0.5 * curvature, enough - hidden
+        stuck = self.not_halved >= given.in_part
+        self.solved = solved if solved.feasible and gain >= needed else None
+        rose = 2.0 * gain < -hidden and solved.rounds > 1 and self.idle < 2
+        self.cautious = given.cautious and (rose or (stuck and not solved.feasible))
+        if self.solved:
+            self._go(end, gain)
+            return True
+        inside = stuck and solved.feasible and 0.0 < slope < curvature
+        if inside and 0.5 * slope**2 >= needed * curvature:
+            t = slope / curvature  # all of the step is in Ω, which is convex; q is least here
             self._go(Point(z.lam + t * step, z.g + t * image), 0.5 * t * slope)
-        if not taken and not looked:
+            return True
+        if not looked:
             self.look()
-        return taken or self._descend()
+        return self._descend()
 
     def _descend(self) -> bool:
         """Go along λ̂ − λ; return whether q falls."""
@@ -332,15 +332,22 @@ class NewtonIteration:
 # --- Step 3: a solve on a face of the feasible set --------------------------------------------
 
 
+class FaceSolution(NamedTuple):
+    """The end of a solve on a face."""
+
+    end: Point  # where PCPG has ended on the last face
+    feasible: bool  # whether that is in Ω and fulfils Gλ = e
+    left: float  # ‖P_f(Fλ − d)‖ there
+    rounds: int  # runs of PCPG, each on a smaller face
+    excluding: Array | None  # local rows that exclude each other, if it has found such
+
+
 class FaceSolver:
     """PCPG on faces; keeps projectors, preconditioner and directions while the face stays.
 
     Attributes:
         directions: Those of PCPG, with an estimate of ‖F‖.
         coarse: Gλ = e on the face entered; its ``coordinates`` of a gradient are the μ there.
-        left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
-        rounds: Runs of PCPG in the last solve, each on a smaller face.
-        excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
     def __init__(
@@ -358,30 +365,27 @@ class FaceSolver:
         self.directions.norm = qp.norm
         self._face: Face  # that entered
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
-        self.excluding: Array | None = None
-        self.left, self.rounds = np.inf, 0
 
     def solve(
         self, start: Point, face: Face, optimality: float, resume: bool, cautious: bool
-    ) -> tuple[Point, bool]:
+    ) -> FaceSolution:
         """Step 3: solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
         ‖g^P‖ is that at the start, a feasible point of the face; ``resume``: PCPG has stopped
-        there, and goes on if the face stays; ``cautious``: rows leave as they block. Return where
-        PCPG ended on the last face, and whether that is in Ω and fulfils Gλ = e.
+        there, and goes on if the face stays; ``cautious``: rows leave as they block.
         """
-        z, stays, self.rounds = start, self._enter(face) and resume, 0
+        z, stays, rounds, excluding = start, self._enter(face) and resume, 0, None
         while True:
-            self.rounds += 1
+            rounds += 1
             # Step 3a: PCPG on the face; where F does not see a direction, along it past a bound
             end, broken = self._pcpg(z, optimality, stays)
             if broken and not self._has_left(end):
-                end = self._along_null_space(end)
+                end, excluding = self._along_null_space(end)
             # Step 3b: rows that have left Ω leave the face, where Gλ = e is restored
             out, stays = self._has_left(end), False
-            if not out or self._steps.cg >= self._max_it:
+            if not out or excluding is not None or self._steps.cg >= self._max_it:
                 break
-            if cautious and self.rounds <= self._parameters.one_by_one:
+            if cautious and rounds <= self._parameters.one_by_one:
                 z = self._blocked(z, end)
                 continue
             if (restored := self._restored(end)) is None:
@@ -393,7 +397,8 @@ class FaceSolver:
             found, _ = project_onto_feasible(self._qp.coarse, boundary, end.lam)
             end = Point(found, end.g + self._qp.roughly(found - end.lam))
             out = imbalance(self._qp.coarse, found) > HELD
-        return end, not out
+        left = norm_over(self._qp.coarse.comm, self.directions.r)
+        return FaceSolution(end, not out, left, rounds, excluding)
 
     def _enter(self, face: Face) -> bool:
         """Make projectors and preconditioner of a face; return whether it is the last one.
@@ -412,10 +417,8 @@ class FaceSolver:
         self.coarse = qp.coarse.on_face(face)
         self._on_face = replace(qp, coarse=self.coarse, preconditioner=None)
         if self._curved:
-            F, bend = qp.roughly, face.bend
-            self._on_face = replace(
-                self._on_face, F=lambda x: F(x) + bend(x), rough=None, recycled=None
-            )
+            bent = replace(self._on_face, F=lambda x: qp.roughly(x) + face.bend(x))
+            self._on_face = replace(bent, rough=None, recycled=None)
         return same
 
     def _blocked(self, z: Point, end: Point) -> Point:
@@ -443,11 +446,11 @@ class FaceSolver:
         apart = self._qp.feasible.project(z.lam) - z.lam
         return any_rank(self._qp.coarse.comm, (apart != 0.0) & (self._face.status != Status.SLIP))
 
-    def _along_null_space(self, z: Point) -> Point:
+    def _along_null_space(self, z: Point) -> tuple[Point, Array | None]:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
         Where no bound ends it, neither F nor G sees it and q falls along it, rows that depend
-        on each other want gaps that exclude each other: ``excluding`` says so.
+        on each other want gaps that exclude each other: return these, too, else None.
         """
         own, qp, given = self.directions, self._qp, self._parameters
         for w in (own.p, own.r):
@@ -465,7 +468,7 @@ class FaceSolver:
             length = least(qp.coarse.comm, max(bound, 0.0))
             if np.isfinite(length):
                 step = given.beyond * length
-                return Point(z.lam + step * w, z.g + step * Fw)
+                return Point(z.lam + step * w, z.g + step * Fw), None
             # Farkas: p in the cone of recession of Ω with Fp = 0, Gp = 0 and dᵀp > 0
             p = qp.feasible.project(given.far / size * w) * (size / given.far)
             Qp, d, Fp = p - qp.coarse.project(p), qp.d, qp.F(p)
@@ -473,9 +476,9 @@ class FaceSolver:
             unseen = max(FF / max(own.norm, TINY) ** 2, QQ) <= given.rounding**2 * pp
             if pp > 0.0 and unseen and pd > given.apart * np.sqrt(dd * pp):
                 most = largest(qp.coarse.comm, p)
-                self.excluding = np.flatnonzero(np.abs(p) > given.takes_part * most)
+                return z, np.flatnonzero(np.abs(p) > given.takes_part * most)
             break
-        return z
+        return z, None
 
     def _unseen(self, w: Array, Fw: Array) -> tuple[Array, Array]:
         """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see.
@@ -500,7 +503,6 @@ class FaceSolver:
         lowest = 0.0 if self._rule.waits else given.final * self._rule.tolerance
         rule, norm = StoppingRule(max(target, lowest)), own.norm
         end, reason = pcpg(self._on_face, z, rule, self._steps, self._max_it, self._monitor, own)
-        self.left = norm_over(qp.coarse.comm, own.r)
         if self._curved:
             end = Point(end.lam, end.g - face.bend(end.lam - z.lam))
             own.norm = norm  # small circles bend far more than F does
@@ -561,7 +563,7 @@ def newton(
         reason = ConvergedReason.DIVERGED_STALLED
         state.look()
     # without friction and an earlier λ the first solve is on the face of the start, as it shows ‖F‖
-    looks = start.lam is not None or friction
+    looks, excluding = start.lam is not None or friction, None
     while reason == ConvergedReason.ITERATING:
         first, face = state.z, state.face_hat
         if looks:
@@ -576,11 +578,11 @@ def newton(
             # Step 2: the face
             first, face = state.wanted_face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        end, feasible = solver.solve(first, face, state.residual, state.resume, state.cautious)
+        solved = solver.solve(first, face, state.residual, bool(state.solved), state.cautious)
         # Step 4: accept where q falls enough
-        if solver.excluding is not None:
+        if (excluding := solved.excluding) is not None:
             reason = ConvergedReason.DIVERGED_CONTRADICTION
-        elif not state.accept(end, feasible) or state.idle >= parameters.patience:
+        elif not state.accept(solved) or state.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_ROUNDING
         steps.outer, looks = steps.outer + 1, True
     return QPResult(
@@ -594,5 +596,5 @@ def newton(
         reference=start.reference,
         norm=solver.directions.norm,
         steps=steps,
-        excluding=np.empty(0, np.int64) if solver.excluding is None else solver.excluding,
+        excluding=np.empty(0, np.int64) if excluding is None else excluding,
     )
