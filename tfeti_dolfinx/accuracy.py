@@ -309,9 +309,9 @@ class Diagnostics:
 
         That of uᵀKu is about ε uᵀDu, D the diagonal, of u less the rigid motion of the body.
         """
-        subdomains, motions = dual.subdomains, dual.coarse.bodies
+        subdomains = dual.subdomains
         u = subdomains.with_rigid(u)
-        bent = u - subdomains.modes_motion(motions.amounts(motions.part_of(u)))
+        bent = dual.coarse.bodies.elastic(u)
         diagonal = joined([block.diagonal for block in subdomains.blocks])
         parts = subdomains.dof_parts
         squares = [sums(diagonal * of**2, parts) for of in (bent, u)]

@@ -190,8 +190,8 @@ class Tools:
     @contextmanager
     def at_prediction(self) -> Iterator[None]:
         """Have the free motions where they are predicted, for a while."""
-        known, self.found = self.found, 0.0 * self.found
-        self.found[self.tool, self.mode] = self.basis @ (self.at_begin() + self.predicted_increment)
+        known, at = self.found, self.at_begin() + self.predicted_increment
+        self.found = self._motions(at)
         try:
             yield
         finally:
@@ -218,6 +218,12 @@ class Tools:
     def _unknowns(self, motions: Array) -> Array:
         """Return the unknowns that have these motions, of shape ``(bodies, k)``."""
         return np.linalg.solve(self.basis, motions[self.tool, self.mode])
+
+    def _motions(self, unknowns: Array) -> Array:
+        """Return the motions that these unknowns are, of shape ``(bodies, k)``, 0 by laws."""
+        motions = np.zeros(self.law.shape)
+        motions[self.tool, self.mode] = self.basis @ unknowns
+        return motions
 
     def place(self, finite: bool) -> None:
         """Place bodies where they are, in finite strain all, else those of large motions."""
@@ -263,8 +269,7 @@ class Tools:
             self.begin = [replace(pose, motion=motion) for pose, motion in both]
             law, self.law = self.law, known.copy()
             self.law[self.tool, self.mode] = law[self.tool, self.mode]
-        self.found[:] = 0.0
-        self.found[self.tool, self.mode] = self.basis @ self.at_begin()
+        self.found = self._motions(self.at_begin())
 
     def at_begin(self) -> Array:
         """Return the unknowns where the load step began, shape ``(num_unknowns,)``."""
@@ -274,9 +279,7 @@ class Tools:
 
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""
-        velocity = np.zeros(self.law.shape)
-        velocity[self.tool, self.mode] = self.basis @ self.velocity_at_end()
-        found = list[ToolMotion]()
+        velocity, found = self._motions(self.velocity_at_end()), list[ToolMotion]()
         for i, body in enumerate(self.bodies):
             contacts, pose = np.flatnonzero(self.of_contact == i), self.pose(i)
             at, v = self.poses[i].centre, None if body.mass is None else velocity[i]
@@ -286,9 +289,7 @@ class Tools:
     def take(self, values: Array) -> None:
         """Take the unknowns of a solution, this rank's, shape ``(num_local,)``. Collective."""
         if self.num_unknowns:
-            values = self._comm.bcast(values, root=self._comm.size - 1)
-            self.found[:] = 0.0
-            self.found[self.tool, self.mode] = self.basis @ values
+            self.found = self._motions(self._comm.bcast(values, root=self._comm.size - 1))
 
     def motion(self, records: ContactRecords, found: bool = False) -> Array:
         """Return displacements of bodies at conditions, shape ``(n, gdim)``; 0 without a body.

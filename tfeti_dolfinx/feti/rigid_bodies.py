@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -83,15 +82,12 @@ def on_rows(parts: list[tuple[Array, Array]], n: int) -> csr_array:
     widths = [dense.shape[1] for _, dense in parts]
     if not sum(widths):
         return csr_array((n, 0))
-    starts = np.cumsum([0, *widths])
-    row = np.concatenate([np.repeat(rows, dense.shape[1]) for rows, dense in parts])
-    own = [
-        (len(rows), np.arange(a, b))
-        for (rows, _), (a, b) in zip(parts, pairwise(starts), strict=True)
-    ]
-    column = np.concatenate([np.tile(columns, count) for count, columns in own])
+    columns = np.split(np.arange(sum(widths)), np.cumsum(widths)[:-1])
+    pairs = list(zip(parts, columns, strict=True))
+    row = np.concatenate([np.repeat(rows, len(own)) for (rows, _), own in pairs])
+    column = np.concatenate([np.tile(own, len(rows)) for (rows, _), own in pairs])
     values = np.concatenate([dense.ravel() for _, dense in parts])
-    return entries_at(row, column, values, (n, int(starts[-1]))).csr()
+    return entries_at(row, column, values, (n, sum(widths))).csr()
 
 
 def orthonormal_columns(A: csr_array) -> csr_array:
@@ -405,6 +401,10 @@ class Bodies:
         W, moments = self.frames, self._subdomains.moments(u)
         return np.asarray(np.einsum("bij,bi->bj", W, moments) / self.nodes[:, None]).ravel()
 
+    def elastic(self, u: Array) -> Array:
+        """Return u less the bodies' motion in it. Collective."""
+        return u - self._subdomains.modes_motion(self.amounts(self.part_of(u)))
+
     def driven(self, free: Motions, load: Array) -> Array | None:
         """Return the part of a load's work on free motions, if it is more than rounding."""
         if not free.count:
@@ -444,7 +444,7 @@ class Bodies:
         Collective; u on all unknowns.
         """
         amounts = self.amounts(self.part_of(u))
-        sizes = self._subdomains.body_sizes([u, u - self._subdomains.modes_motion(amounts)])
+        sizes = self._subdomains.body_sizes([u, self.elastic(u)])
         moved, bent = bcast_from_root(self._subdomains.comm, sizes)
         rigid = (bent <= bends * moved) & (moved >= 0.5 * moved.max(initial=0.0))
         return self.sentence(np.where(rigid[:, None], amounts, 0.0)) if np.any(rigid) else ""

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
-from tfeti_dolfinx.common.parallel import steering, summed
+from tfeti_dolfinx.common.parallel import maxima, steering, summed
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import energy_bound, within
@@ -114,8 +113,7 @@ def measure(
         slips = np.linalg.norm((w[tangents], c[tangents]), axis=2)
         slips /= constraints.contact.tangent_scale
         penetration, begin = max(penetration, slips[0].max()), max(begin, slips[1].max())
-    largest = np.array([penetration, gap, begin])
-    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    penetration, gap, begin = map(float, maxima(comm, np.array([penetration, gap, begin])))
     d = dual.d
     held_d, held_F = (x[face.holding] for x in (d, state.residual + d))
     squares = summed(comm, np.array([x @ x for x in (state.lam, held_d, held_F)]))
@@ -124,7 +122,7 @@ def measure(
     closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))
     v = min_norm_correction(constraints, w, closed)
     # 3. bodies
-    u, subdomains, bodies = state.u, dual.subdomains, dual.coarse.bodies
+    u, subdomains = state.u, dual.subdomains
     trace, diagonal = subdomains.trace_parts, subdomains.diagonal
     closing = sums(diagonal * v**2, trace)
     if len(sets.springs):
@@ -138,7 +136,7 @@ def measure(
     )
     displacements = (
         u,
-        u - subdomains.modes_motion(bodies.amounts(bodies.part_of(u))),
+        dual.coarse.bodies.elastic(u),
         subdomains.extended(v),
         np.zeros_like(u) if before is None else without_loose(dual.coarse, state, u - before),
         subdomains.extended(subdomains.pinv_load[subdomains.trace]),
@@ -169,15 +167,15 @@ def measure(
         alone=alone,
         stiffness=stiffness,
         pushed=pushed,
-        penetration=float(largest[0]),
+        penetration=penetration,
         balance=balance,
         forces=forces,
-        gap=float(largest[1]),
-        begin=float(largest[2]),
+        gap=gap,
+        begin=begin,
         rounding=ROUNDING * float(sum(sizes)),
         error=float(np.sqrt(correction_energies.sum())),
         energy=float(np.sqrt(max(energies.sum(), 0.0))),
-        longest=max(float(correction.max(initial=0.0)), float(largest[0])),
+        longest=max(float(correction.max(initial=0.0)), penetration),
         effect=norm * float(multipliers),
     )
 
