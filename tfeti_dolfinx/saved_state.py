@@ -130,6 +130,11 @@ OF = {
 KINDS = ("subdomains", "nodes", "cells", "rows", "conditions")
 
 
+def absent(*shape: int, dtype: type = float) -> Any:
+    """Return a field of an array that not all problems have."""
+    return field(default_factory=lambda: np.zeros(shape, dtype))
+
+
 @dataclass(frozen=True)
 class SavedState:
     """An accepted solution on this rank, and what the next solve starts from."""
@@ -152,28 +157,19 @@ class SavedState:
     contact: Array  # contact of each condition
     group: Array  # label of the node of each condition
     reached: Array  # whether a condition is within reach
-    # labels of cells, where there are internal variables; else empty
-    cells: Array = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    # velocity in primal order, empty without inertia
-    velocity: Array = field(default_factory=lambda: np.zeros(0))
-    load: Array = field(default_factory=lambda: np.zeros(0))  # load likewise
-    # multipliers of this rank's rows of the predictor, empty without one
-    predicted: Array = field(default_factory=lambda: np.zeros(0))
-    # that of the step which the matrix was made for, shape (); 0 without inertia
-    size: Array = field(default_factory=lambda: np.zeros(()))
-    # what `Recycled` keeps of earlier solves, shape (m, 2, k)
-    directions: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
-    # internal variables of a nonlinear problem in each cell, (cells, w); else empty
-    internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    # motions of rigid bodies, one after the other
-    tools: Array = field(default_factory=lambda: np.zeros(0))
-    # of their unknowns, with mass: velocities, and loads at the begin of the next step
-    tool_speed: Array = field(default_factory=lambda: np.zeros(0))
-    tool_loads: Array = field(default_factory=lambda: np.zeros(0))
-    image: Array = field(default_factory=lambda: np.zeros(0))  # Fλ; empty where it is not known
-    predicted_image: Array = field(default_factory=lambda: np.zeros(0))  # the same of the predictor
-    # D of a nonlinear problem, which rows are scaled with, in primal order; else empty
-    weights: Array = field(default_factory=lambda: np.zeros(0))
+    cells: Array = absent(0, dtype=np.int64)  # labels of cells, where there are internal variables
+    velocity: Array = absent(0)  # velocity in primal order, empty without inertia
+    load: Array = absent(0)  # load likewise
+    predicted: Array = absent(0)  # multipliers of this rank's rows of the predictor
+    size: Array = absent()  # of the step which the matrix was made for, shape (); 0 without inertia
+    directions: Array = absent(0, 2, 0)  # what `Recycled` keeps of earlier solves, shape (m, 2, k)
+    internal: Array = absent(0, 0)  # internal variables in each cell, (cells, w)
+    tools: Array = absent(0)  # motions of rigid bodies, one after the other
+    tool_speed: Array = absent(0)  # velocities of their unknowns, with mass
+    tool_loads: Array = absent(0)  # their loads at the begin of the next step, with mass
+    image: Array = absent(0)  # Fλ; empty where it is not known
+    predicted_image: Array = absent(0)  # the same of the predictor
+    weights: Array = absent(0)  # D of a nonlinear problem, which rows are scaled with, as u
     # whether Newton's method keeps places yet, shape (), see `ModelKeeping`
     freezes: Array = field(default_factory=lambda: np.ones(()))
 
@@ -250,8 +246,7 @@ class SavedState:
             same = same_labels(kept, rows) and same_labels(self.conditions, here["conditions"])
             state = self._in_order(here) if same else self
             if others:  # of another stiffness: what of F and its kernel is known, too
-                none = np.zeros(0)
-                state = replace(state, mu=none, image=none, directions=np.zeros((0, 2, 0)))
+                state = state.without_products()
             found = (state.contact, state.group, state.reached)
             expected = (records.contact, of_groups[records.group], records.within_reach)
             if not same or not all(map(np.array_equal, found, expected)):
@@ -260,6 +255,11 @@ class SavedState:
                     "contacts, conditions and data that it was found with"
                 )
         return state
+
+    def without_products(self) -> SavedState:
+        """Return the state without what is of one F and its kernel alone."""
+        none, directions = np.zeros(0), np.zeros((0, 2, 0))
+        return replace(self, mu=none, image=none, predicted_image=none, directions=directions)
 
     def _held(self, rows: Array, springs: Array) -> Array:
         """Return labels of rows but for those of springs, of which subdomains have so many."""

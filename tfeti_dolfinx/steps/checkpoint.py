@@ -196,11 +196,8 @@ class Checkpoint:
         state = SavedState.from_table(table)
         own = last.subdomains[self._comm.rank] if self._comm.rank < len(last.states) else []
         same = self._comm.size == len(last.states) and own == self._subdomains
-        if not any_rank(self._comm, not same):
-            return state
-        # F may be another there: it depends on K⁺, but for its values up to Gᵀ
-        none, directions = np.zeros(0), np.zeros((len(state.lam), 2, 0))
-        return replace(state, mu=none, image=none, predicted_image=none, directions=directions)
+        # F may be another elsewhere: it depends on K⁺, but for its values up to Gᵀ
+        return state.without_products() if any_rank(self._comm, not same) else state
 
     def read_fields(self, number: int, kept: Kept) -> Table:
         """Return the fields of a step, of those that ``read`` found, on this rank."""
