@@ -15,8 +15,9 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import quotient, sum_rows
+from tfeti_dolfinx.common.files import written_whole
 from tfeti_dolfinx.common.parallel import largest, maxima, summed
-from tfeti_dolfinx.common.validation import named, written_whole
+from tfeti_dolfinx.common.validation import named
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import position_of
 from tfeti_dolfinx.contact.records import ContactStatus

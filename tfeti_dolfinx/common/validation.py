@@ -1,13 +1,11 @@
-"""Checks of what is given, files that are whole, parameters that say once what they are."""
+"""Checks of what is given, and parameters that say once what they are."""
 
 import math
-import os
 import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from numbers import Integral, Real
-from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -135,33 +133,6 @@ def values_at(
         return np.broadcast_to(values, size)
     except ValueError:
         raise InputError(f"{what} has the shape {values.shape}; expected {size}") from None
-
-
-# --- Names of files, and files that are whole -------------------------------------------------
-
-PARTIAL = ".partial-"  # how the name of a file begins that is not whole
-
-
-def checked_path(path: Any, *suffixes: str) -> Path:
-    """Return a file's name with one of these endings; raise an InputError where it has none."""
-    expected = f"a name that ends with {' or '.join(suffixes)}"
-    checked_type(path, (str, os.PathLike), "path", expected)
-    target = Path(path)
-    if target.suffix not in suffixes:
-        raise InputError(f"{target}: expected {expected}")
-    return target
-
-
-@contextmanager
-def written_whole(target: Path) -> Iterator[Path]:
-    """Give a name to write to inside the block; a whole file has the target's. Not collective."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f"{PARTIAL}{target.name}")
-    try:
-        yield partial
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 # --- Descriptions of parameters ---------------------------------------------------------------

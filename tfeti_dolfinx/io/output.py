@@ -4,7 +4,6 @@ import ctypes
 import errno
 import os
 import re
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -20,7 +19,8 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.common.validation import checked_path, checked_type, named
+from tfeti_dolfinx.common.files import checked_path, remove
+from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.untorn import NO_TAG
 from tfeti_dolfinx.solution import Solution
@@ -140,7 +140,7 @@ class SeriesFile:
         with raised_on_all_ranks(self._comm), named(f"cannot write {name}", OSError):
             if self._comm.rank == 0:
                 name.parent.mkdir(parents=True, exist_ok=True)
-                _remove(self.partial)  # of an earlier run
+                remove(self.partial)  # of an earlier run
                 if self._kind != ".bp":
                     self.partial.mkdir()
         self._writer: Any = None
@@ -187,7 +187,7 @@ class SeriesFile:
         names, parent = [self._name.name], self._name.parent
         with raised_on_all_ranks(self._comm), named(f"cannot write {self._name}", OSError):
             if self._comm.rank == 0:
-                _remove(self._name)  # first: it names parts
+                remove(self._name)  # first: it names parts
                 if self._kind == ".bp":
                     os.replace(self.partial, self._name)
                 if self._kind == ".pvd":
@@ -426,11 +426,4 @@ def _drop(path: Path, comm: MPI.Intracomm) -> None:
     comm.barrier()
     if comm.rank == 0:
         with suppress(OSError):
-            _remove(path)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+            remove(path)

@@ -15,19 +15,18 @@ from dolfinx import plot as dplot
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.files import checked_path, written_whole
 from tfeti_dolfinx.common.validation import (
     FINITE,
     POSITIVE,
     checked_callable,
     checked_flag,
     checked_number,
-    checked_path,
     checked_type,
     checked_vector,
     named,
     shown,
     values_at,
-    written_whole,
 )
 from tfeti_dolfinx.contact.partner import Obstacle
 from tfeti_dolfinx.contact.rigid_body import Pose, RigidBody

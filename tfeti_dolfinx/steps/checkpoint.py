@@ -10,14 +10,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, cast
 
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.files import PARTIAL, written_whole
 from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.common.validation import PARTIAL, checked_type, named, written_whole
+from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table, numbered
 
@@ -183,7 +184,8 @@ class Checkpoint:
                 kept = {"fields": of_fields, "subdomains": parts} if fields else {}
                 with (self.path / RECORDS).open("ab") as file:
                     file.write(_sealed({**record, "kept": kept}))
-                    _to_disk(file)
+                    file.flush()
+                    os.fsync(file.fileno())
                 now = Index(number, max(before.ranks, comm.size), digest=digest, about=dict(about))
                 self._commit(replace(now, states=states, subdomains=parts))
                 for rank in range(before.ranks):
@@ -217,9 +219,8 @@ class Checkpoint:
                 arrays[column] = values[np.argsort(labels)]
                 place = np.searchsorted(self._subdomains, labels >> SHIFT)
                 arrays[column + COUNTS] = np.bincount(place, minlength=len(self._subdomains))
-        with written_whole(self.path / name) as partial, partial.open("wb") as file:
-            np.savez(file, **cast(dict[str, Any], arrays))
-            _to_disk(file)
+        with written_whole(self.path / name) as partial:
+            np.savez(partial, **cast(dict[str, Any], arrays))
         return _hash((self.path / name).read_bytes()).hexdigest()
 
     def _load(
@@ -258,9 +259,8 @@ class Checkpoint:
 
     def _commit(self, index: Index) -> None:
         """Let an index count."""
-        with written_whole(self.path / INDEX) as partial, partial.open("wb") as file:
-            file.write(_sealed(asdict(index)))
-            _to_disk(file)
+        with written_whole(self.path / INDEX) as partial:
+            partial.write_bytes(_sealed(asdict(index)))
         self.index = index
 
     def _checked_folder(self) -> Index:
@@ -339,9 +339,3 @@ def _unsealed(line: bytes, file: Path) -> dict[str, Any]:
         if checksum == _hash(json.dumps(found).encode()).hexdigest():
             return found
     raise damaged(file, "it")
-
-
-def _to_disk(file: BinaryIO) -> None:
-    """Bring a file to the disk, so that a name that it gets later never has less."""
-    file.flush()
-    os.fsync(file.fileno())

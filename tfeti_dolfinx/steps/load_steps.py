@@ -21,17 +21,16 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing, check_same_problem
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.files import checked_path, written_whole
 from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.common.validation import (
     checked_callable,
     checked_flag,
     checked_number,
-    checked_path,
     checked_type,
     is_whole,
     named,
     shown,
-    written_whole,
 )
 from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.io.output import POINTS, Series, changing_fields, checked_target, fields_of
