@@ -286,7 +286,7 @@ class ContactProblem:
             given, own = self._settings, self._settings.extensions
             with added_options(given.prefix, given.factor_options):  # of faces, and of a late S
                 solved = solve_with_friction(dual, options, start, own.monitor, goal, own.stopping)
-        result, accuracy, settling = solved
+        result, accuracy, friction = solved
         state, lam = accuracy.recovered, result.lam.copy()
         self._let_go = np.zeros(0, dtype=bool)
         if state.loose.count > dual.coarse.free_motions.count:
@@ -303,7 +303,7 @@ class ContactProblem:
         end = WarmStart(gluing, lam, result.mu, system.kplus_number)
         self._start = end if result.reason > 0 else None
         # 3. what the report says of it
-        counts = SolverCounts.of_run(dual, result, settling)
+        counts = SolverCounts.of_run(dual, result, friction)
         self._counts = SolverCounts(**added(vars(self._counts), vars(counts)))
         contacts = gluing.contacts_of(result.excluding) if result.reason <= 0 else []
         excluding = system.search.named(contacts)
@@ -315,9 +315,9 @@ class ContactProblem:
             energy, rtol = accuracy.measures.energies, options.number
             outcome.warnings = self._diagnostics.found(dual, solution, outcome, energy, rtol)
         outcome.notes, self._outcome = notes_of(outcome, solution), outcome
-        body = [*d.body_names, *system.tools.free_names][settling.body]
+        body = [*d.body_names, *system.tools.free_names][friction.body]
         said = outcome.warnings + outcome.notes
-        conclude(result, accuracy, now, d.comm, excluding, body, settling.slides, said)
+        conclude(result, accuracy, now, d.comm, excluding, body, friction.slides, said)
         return solution, accuracy.allowed.overlap
 
     def _log_warnings(self) -> None:
@@ -466,6 +466,7 @@ class ContactProblem:
         self._system.tools.begin_here()
         self._system.count_slips_from(solution)
         self._accepted = (solution, start)
+        self._begin_next()
 
     def go_back(self) -> None:
         """Return to the last accepted solution, or to what ``u`` was at first. Collective.
@@ -563,6 +564,9 @@ class ContactProblem:
 
     def _predict(self) -> None:
         """Set the prediction of a step; nothing without inertia."""
+
+    def _begin_next(self) -> None:
+        """Begin the next load step where one has ended: without inertia nothing is to do."""
 
     def _check_state(self, state: SavedState) -> None:
         """Raise an InputError where a state is of something else. Not collective."""

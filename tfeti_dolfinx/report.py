@@ -106,16 +106,16 @@ class SolverCounts:
     newton_steps: int = 0  # of a nonlinear problem, each a linearised problem
 
     @classmethod
-    def of_run(cls, dual: Dual, result: QPResult, settling: FixedPointStatus) -> Self:
+    def of_run(cls, dual: Dual, result: QPResult, friction: FixedPointStatus) -> Self:
         """Return the counts of a solver's run."""
         preconditioner, inner, steps = dual.preconditioner, dual.deflation, result.steps
         return cls(
             F_multiplications=dual.F.count,
             preconditioner_multiplications=(0 if preconditioner is None else preconditioner.count),
             power_method_multiplications=dual.norm_count,
-            recoveries=settling.looks,
-            friction_iterations=settling.iterations,
-            friction_newton_steps=settling.newton_steps,
+            recoveries=friction.looks,
+            friction_iterations=friction.iterations,
+            friction_newton_steps=friction.newton_steps,
             outer_iterations=steps.outer,
             newton_faces=steps.faces,
             cg_steps=steps.cg,
@@ -220,7 +220,7 @@ class Outcome:
         dual: Dual,
         result: QPResult,
         accuracy: Accuracy,
-        settling: FixedPointStatus,
+        friction: FixedPointStatus,
         excluding: list[str],
         nearly_free: list[dict[str, Any]],
     ) -> Self:
@@ -244,8 +244,8 @@ class Outcome:
             local_operators=_local_operators(dual),
             converged_reason=result.reason.name,
             peak_memory_mb=kilobytes / 1024.0,
-            residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
-            tolerances=_tolerances(solution, accuracy) | {"friction": settling.tolerance},
+            residuals=_residuals(solution, dual, result, accuracy) | {"friction": friction.change},
+            tolerances=_tolerances(solution, accuracy) | {"friction": friction.tolerance},
             estimates=accuracy.estimates,
             tools=[str(solution.tool(i)) for i in range(len(solution.tool_motions))],
         )

@@ -505,18 +505,11 @@ class NonlinearContactProblem(ContactProblem):
                 )
         super().update(values=values, gap=gap)
 
-    def accept(self) -> None:
-        """Take the last solution as the end of a load step; internal variables are committed.
-
-        Raises:
-            InputError: As ``ContactProblem.accept``.
-        """
-        before = self._accepted
-        super().accept()
-        if self._accepted is not before:
-            self._state.commit()
-            self._begin = np.array(self.u.x.array)
-            self._set(self._begin)
+    def _begin_next(self) -> None:
+        super()._begin_next()
+        self._state.commit()
+        self._begin = np.array(self.u.x.array)
+        self._set(self._begin)
 
     def state(self) -> SavedState:
         """Return the last accepted solution, with internal variables, for ``restore``.

@@ -331,17 +331,10 @@ class ContactDynamics(ContactProblem):
             motion.predicted = self._predictor.nearest(free, inertia.M, system.gluing, system.tools)
         system.change("load")
 
-    def accept(self) -> None:
-        """Take the last solution as the end of the step: the next one begins there.
-
-        Raises:
-            InputError: As ``ContactProblem.accept``.
-        """
-        before = self._accepted
-        super().accept()
-        if self._accepted is not before:
-            assert self.solution.v is not None
-            self._system.forms.inertia.move(np.array(self.u.x.array), self.solution.v)
+    def _begin_next(self) -> None:
+        super()._begin_next()
+        assert self.solution.v is not None
+        self._system.forms.inertia.move(np.array(self.u.x.array), self.solution.v)
 
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
