@@ -140,7 +140,7 @@ class ContactProblem:
             with agreeing(comm, "stress(u)") as given:
                 given["stress(u)"] = sigma = self._look_at_stress()
                 check_mesh(sigma, "stress", decomposition.mesh)
-        if self.options.rtol == "auto" and stress is None:
+        elif self.options.rtol == "auto":
             raise InputError(
                 f"-{petsc_options_prefix}rtol auto: the problem has no stress to estimate the "
                 "discretisation error from; expected ContactProblem(..., stress=sigma)"
@@ -229,6 +229,7 @@ class ContactProblem:
             self._compose_report()
             raise
         self._compose_report()
+        self._report_motion()
         self._log_warnings()
         if self.options.view and self.decomposition.comm.rank == 0:
             options = self.options.view_text(self._settings.prefix)
@@ -475,10 +476,6 @@ class ContactProblem:
         """
         with agreeing(self.decomposition.comm, "go_back"):
             pass
-        self._return()
-
-    def _return(self) -> None:
-        """Return to the last accepted solution. Not collective."""
         self._solution, self._start = self._accepted or (None, None)
         self._system.tools.go_back()
         last = self._solution
@@ -545,7 +542,7 @@ class ContactProblem:
         solution = self._make_solution(state.u, state.lam, face, gluing)
         start = WarmStart(gluing, state.lam, state.mu, system.kplus_number)
         self._accepted = solution, start
-        self._return()
+        self.go_back()
         system.count_slips_from(solution)
 
     # ------------------------------------- what bodies with mass and nonlinear ones add
@@ -564,6 +561,9 @@ class ContactProblem:
 
     def _predict(self) -> None:
         """Set the prediction of a step; nothing without inertia."""
+
+    def _report_motion(self) -> None:
+        """Add energies, work and forces to a report; nothing without inertia. Collective."""
 
     def _begin_next(self) -> None:
         """Begin the next load step where one has ended: without inertia nothing is to do."""

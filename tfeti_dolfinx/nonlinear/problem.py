@@ -562,6 +562,7 @@ class NonlinearContactProblem(ContactProblem):
         share = self._tolerances.negligible * self._exact
         return np.asarray(share * subdomains.body_sizes([begin])[0])
 
-    def _return(self) -> None:
-        super()._return()
+    def go_back(self) -> None:
+        """Return to the last accepted solution; see ``ContactProblem.go_back``."""
+        super().go_back()
         self._set(self.u.x.array)

@@ -306,16 +306,6 @@ class ContactDynamics(ContactProblem):
         """
         self._system.forms.inertia.take_step(size)
 
-    def solve(self) -> fem.Function:
-        """Solve for the end of the step; see ``ContactProblem.solve``.
-
-        Raises:
-            InputError: As there, or the step has no size yet.
-        """
-        super().solve()
-        self._look()
-        return self.u
-
     def _predict(self) -> None:
         inertia, system = self._system.forms.inertia, self._system
         motion = inertia.motion
@@ -397,8 +387,7 @@ class ContactDynamics(ContactProblem):
         solution.v = motion.start_velocity + 2.0 / motion.time_step * way
         return solution
 
-    def _look(self) -> None:
-        """Put energies, work and forces into the report."""
+    def _report_motion(self) -> None:
         system = self._system
         motion = balance(system.forms, system.dual, self.solution, system.tools)
         if self._predictor is not None:
@@ -510,9 +499,9 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         struck = ContactProblem._make_solution(self, w, forces, face, gluing)
         self._blows = [struck.contact(i).resultant.force for i in range(len(self.contacts))]
 
-    def _look(self) -> None:
+    def _report_motion(self) -> None:
         self._system.forms.inertia.ends = self._system.forms.forces()
-        super()._look()
+        super()._report_motion()
         forces = self.report.contact_forces
         for i, blow in enumerate(self._blows):
             forces[i] = [a + float(b) for a, b in zip(forces[i], blow, strict=True)]
