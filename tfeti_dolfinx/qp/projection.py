@@ -22,12 +22,9 @@ class ProjectionParameters:
     max_trials: int = 300  # points looked at: far more than Newton takes where it converges
     # of the terms of Gλ − e: what the coarse problem's factors leave at best
     balanced: float = 1e-13
-    # of the same: below it a step that leaves more than `slow` has met the damping, a kink, or
-    # rounding
-    nearly: float = 1e-6
+    nearly: float = 1e-6  # of the same: below it steps that leave more than `slow` meet rounding
     slow: float = 0.1  # share of what is left
-    # so many such steps in a row, with the least damping, and rounding has ended it
-    slowly: int = 8
+    slowly: int = 8  # so many such steps in a row, and rounding has ended it
     # of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small
     # beside 1, so that they stay Newton's
     damping: float = 1e-8
@@ -96,15 +93,13 @@ def project_onto_feasible(
         unmet = unmet + 1 if whole else 0
         if whole:
             damping = max(parameters.eased * damping, parameters.least_damping)
-        elif slowly == 0 and (length < 1.0 or damping > parameters.damping):
+        elif length < 1.0 or damping > parameters.damping:
             damping = parameters.damping
         near = trial.left <= parameters.nearly * scale
         slow = bcast_from_root(comm, near and trial.left > parameters.slow * least)
         slowly, least = slowly + 1 if slow else 0, min(least, trial.left)
         if slowly > parameters.slowly:
             break
-        if slow:
-            damping = parameters.least_damping
     return trial.lam, trial.alpha
 
 
