@@ -385,6 +385,8 @@ class J2Plasticity(Plasticity):
         plastic_strain: Plastic strain where the load step began, components xx, yy, zz, xy and in
             space xz, yz.
         p: Accumulated plastic strain there.
+        share: Share of the elastic moduli that plastic points have in the tangent at least, and
+            none of it in the residual; ``NonlinearContactProblem`` sets it.
 
     Raises:
         InputError: Something given does not fit; the message names it.
@@ -393,6 +395,7 @@ class J2Plasticity(Plasticity):
     def _begin(self) -> None:
         self._gdim, elasticity, u = self.elasticity.mesh.geometry.dim, self.elasticity, self.u
         Q, W = self._space(), self._space((6 if self._gdim == 3 else 4,))
+        self.share = fem.Constant(elasticity.mesh, 0.0)
         self.plastic_strain = fem.Function(W, name="plastic_strain")
         self.p = fem.Function(Q, name="accumulated_plastic_strain")
         self._dp = self._updated(Q, name="plastic_increment")  # of this load step
@@ -408,6 +411,11 @@ class J2Plasticity(Plasticity):
 
     def _accumulated(self) -> Array:
         return np.asarray(self.p.x.array + self._dp.x.array)
+
+    @property
+    def regularisation(self) -> Any:
+        """Share of the elastic moduli that plastic points have in the tangent besides, in UFL."""
+        return ufl.max_value(self.share, super().regularisation)
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""
@@ -441,7 +449,7 @@ class J2Plasticity(Plasticity):
     def of_update(self, F: ufl.Form, w: Any, v: Any) -> ufl.Form:
         """Return the derivative along w of a residual as ``update`` returns stresses.
 
-        And what is for tangents alone, where there is no hardening.
+        And what is for tangents alone.
         """
         e, mu = self.elasticity.strain(w), self.elasticity.mu
         plastic = ufl.conditional(ufl.gt(self._dp, 0.0), 2 * mu, 0.0)

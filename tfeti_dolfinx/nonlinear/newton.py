@@ -1,8 +1,9 @@
-"""Newton's method with the contact inside: tolerances, how long a model is kept, acceleration."""
+"""Newton's method with the contact inside: tolerances, models that are kept, acceleration."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
+from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
@@ -57,6 +58,11 @@ class NewtonTolerances:
         anderson: Earlier iterates that Anderson's acceleration combines; 0: none, it is off.
         dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
             are taken for 0.
+        share: In small strain ready laws of plasticity begin with this share of the elastic moduli
+            in their tangents; 0: none, ever. See ``Regularisation``.
+        most_share: They have at most this share.
+        again: Where two steps after each other are shortened, at least this one.
+        undershot: Of the residual along a step: what a tangent with a share may leave of it.
         slow: A kept model is made anew where an increment is more than this share of the last one.
         difference: Length of the step, of the displacement, of the difference quotient that a
             given J is compared with where Newton's method has failed.
@@ -87,6 +93,10 @@ class NewtonTolerances:
     turning: float = 0.03
     anderson: int = 3
     dependent: float = 1e-12
+    share: float = 0.1
+    most_share: float = 0.2
+    again: float = 0.05
+    undershot: float = 0.3
     slow: float = 0.7
     difference: float = 1e-6
     another: float = 0.3
@@ -131,6 +141,41 @@ class ModelKeeping:
             good = size <= tol.settled * self.first
         self.before = size
         return good and t == 1.0 and not slow
+
+
+@dataclass
+class Regularisation:
+    """Decides what share of the elastic moduli plastic points have in the tangent.
+
+    Consistent tangents are soft where a point yields, and a step goes too far where it unloads:
+    points yield and unload in turn, and steps are shortened for a few of them. With a share of the
+    elastic moduli steps go less far, and problems with moduli that differ less take fewer
+    multiplications. Where a body flows as a whole such a tangent is too stiff. So it is
+    Levenberg's and Marquardt's (Nocedal, Wright, Numerical Optimization, 2006, section 10.3): if a
+    is the stiffness along a step and b that of the share, b/(a + b) of the residual is left.
+    """
+
+    tolerances: NewtonTolerances
+    shares: list[fem.Constant]  # of the laws
+    shortened: int = 0  # steps, one after the other
+
+    def __post_init__(self) -> None:
+        for share in self.shares:
+            share.value = self.tolerances.share
+
+    def follow(self, t: float, left: float, kept: bool) -> None:
+        """Set the next share, after a step of length t that leaves so much of the residual."""
+        tol, self.shortened = self.tolerances, self.shortened + 1 if t < 1.0 else 0
+        for share in self.shares if tol.share else ():
+            value = float(share.value)
+            if self.shortened > 1:
+                share.value = min(max(4.0 * value, tol.again), tol.most_share)
+            elif left > tol.undershot and not kept:
+                wanted, found = (
+                    tol.undershot / (1.0 - tol.undershot),
+                    left / (1.0 - min(left, 0.99)),
+                )
+                share.value = value * wanted / found
 
 
 @dataclass

@@ -32,8 +32,13 @@ from tfeti_dolfinx.errors import (
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms, rotation_free_tangent
-from tfeti_dolfinx.nonlinear.materials import Plasticity, derivative_of, laws_of
-from tfeti_dolfinx.nonlinear.newton import Anderson, ModelKeeping, NewtonTolerances
+from tfeti_dolfinx.nonlinear.materials import J2Plasticity, Plasticity, derivative_of, laws_of
+from tfeti_dolfinx.nonlinear.newton import (
+    Anderson,
+    ModelKeeping,
+    NewtonTolerances,
+    Regularisation,
+)
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
@@ -177,6 +182,8 @@ class NonlinearContactProblem(ContactProblem):
         # of where bodies are
         self._last_digit = EPSILON * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
+        shares = [law.share for law in laws if isinstance(law, J2Plasticity)]
+        self._regularisation = Regularisation(self._tolerances, shares)
         self._first_increment = self._loosest  # of the last load step
         if finite:
             self._check_rotations()
@@ -232,7 +239,8 @@ class NonlinearContactProblem(ContactProblem):
             increments = self._increments(d, end, max(at_begin, most))
             increment = float(increments.max(initial=0.0))
             # 2. line search
-            t, remainders = self._line_search(u, d)
+            t, at_end, remainders = self._line_search(u, d)
+            self._regularisation.follow(t, at_end, forms.kept)
             # the next increment
             expected = float(np.max(np.minimum(remainders, 1.0) * increments, initial=0.0))
             # 3. end
@@ -417,10 +425,10 @@ class NonlinearContactProblem(ContactProblem):
                 for update in self._updates:
                     update()
 
-    def _line_search(self, u: Array, d: Array) -> tuple[float, Array]:
-        """Go to u + t d, and return the length t in (0, 1], and |r(1)/r(0)| of bodies. Collective.
+    def _line_search(self, u: Array, d: Array) -> tuple[float, float, Array]:
+        """Go to u + t d, and return t in (0, 1], r(1)/r(0), and |r(1)/r(0)| of bodies. Collective.
 
-        They are of each body's part of d, the length of all.
+        The last are of each body's part of d. Below 0 d goes too far.
         """
         tol, subdomains = self._tolerances, self._system.subdomains
         primal = subdomains.with_rigid(self.dofs.to_primal(d))
@@ -436,9 +444,9 @@ class NonlinearContactProblem(ContactProblem):
         remainders = np.ones(len(energies))
         np.divide(np.abs(slopes), energies, remainders, where=energies > rounding)
         a, low, high = 0.0, float(-sum(energies)), float(sum(slopes))
-        enough = self._curvature * abs(low)
+        enough, left = self._curvature * abs(low), high / min(low, -TINY)
         if high <= max(enough, sum(rounding)):
-            return b, remainders
+            return b, left, remainders
         for _ in range(tol.max_line_search):  # regula falsi in Illinois' form
             t = b - high * (b - a) / (high - low)
             slope = float(sum(self._slopes(u, d, t) + forces))
@@ -448,7 +456,7 @@ class NonlinearContactProblem(ContactProblem):
                 b, high, low = t, slope, 0.5 * low
             else:
                 a, low, high = t, slope, 0.5 * high
-        return t, remainders
+        return t, left, remainders
 
     def _longest(self, u: Array, d: Array, forces: Array) -> tuple[float, Array]:
         """Return the longest step that leaves no cell inside out, and r at its end. Collective."""
