@@ -59,10 +59,8 @@ class NewtonTolerances:
         dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
             are taken for 0.
         share: In small strain ready laws of plasticity begin with this share of the elastic moduli
-            in their tangents; 0: none, ever. See ``Regularisation``.
-        most_share: They have at most this share.
-        again: Where two steps after each other are shortened, at least this one.
-        undershot: Of the residual along a step: what a tangent with a share may leave of it.
+            in their tangents, see ``Regularisation``; 0: none.
+        undershot: Of the residual along a step a tangent with a share may leave this much.
         slow: A kept model is made anew where an increment is more than this share of the last one.
         difference: Length of the step, of the displacement, of the difference quotient that a
             given J is compared with where Newton's method has failed.
@@ -94,9 +92,7 @@ class NewtonTolerances:
     anderson: int = 3
     dependent: float = 1e-12
     share: float = 0.1
-    most_share: float = 0.2
-    again: float = 0.05
-    undershot: float = 0.3
+    undershot: float = 0.35
     slow: float = 0.7
     difference: float = 1e-6
     another: float = 0.3
@@ -149,33 +145,26 @@ class Regularisation:
 
     Consistent tangents are soft where a point yields, and a step goes too far where it unloads:
     points yield and unload in turn, and steps are shortened for a few of them. With a share of the
-    elastic moduli steps go less far, and problems with moduli that differ less take fewer
-    multiplications. Where a body flows as a whole such a tangent is too stiff. So it is
-    Levenberg's and Marquardt's (Nocedal, Wright, Numerical Optimization, 2006, section 10.3): if a
-    is the stiffness along a step and b that of the share, b/(a + b) of the residual is left.
+    elastic moduli steps go less far, and linearised problems have moduli that differ less. Where a
+    body flows as a whole such a tangent is too stiff. So the share decreases as that of Levenberg's
+    and Marquardt's method (Nocedal, Wright, Numerical Optimization, 2006, section 10.3): with a
+    stiffness a along a step, and b from the share, b/(a + b) of the residual is left.
     """
 
     tolerances: NewtonTolerances
     shares: list[fem.Constant]  # of the laws
-    shortened: int = 0  # steps, one after the other
 
     def __post_init__(self) -> None:
         for share in self.shares:
             share.value = self.tolerances.share
 
-    def follow(self, t: float, left: float, kept: bool) -> None:
-        """Set the next share, after a step of length t that leaves so much of the residual."""
-        tol, self.shortened = self.tolerances, self.shortened + 1 if t < 1.0 else 0
-        for share in self.shares if tol.share else ():
-            value = float(share.value)
-            if self.shortened > 1:
-                share.value = min(max(4.0 * value, tol.again), tol.most_share)
-            elif left > tol.undershot and not kept:
-                wanted, found = (
-                    tol.undershot / (1.0 - tol.undershot),
-                    left / (1.0 - min(left, 0.99)),
-                )
-                share.value = value * wanted / found
+    def follow(self, left: float, kept: bool) -> None:
+        """Set the next share, where a step with a tangent of its own leaves so much."""
+        most = self.tolerances.undershot
+        if left > most and not kept:
+            found, wanted = (x / (1.0 - x) for x in (min(left, 0.99), most))  # b/a
+            for share in self.shares:
+                share.value *= wanted / found
 
 
 @dataclass

@@ -240,7 +240,7 @@ class NonlinearContactProblem(ContactProblem):
             increment = float(increments.max(initial=0.0))
             # 2. line search
             t, at_end, remainders = self._line_search(u, d)
-            self._regularisation.follow(t, at_end, forms.kept)
+            self._regularisation.follow(at_end, forms.kept)
             # the next increment
             expected = float(np.max(np.minimum(remainders, 1.0) * increments, initial=0.0))
             # 3. end
@@ -444,7 +444,7 @@ class NonlinearContactProblem(ContactProblem):
         remainders = np.ones(len(energies))
         np.divide(np.abs(slopes), energies, remainders, where=energies > rounding)
         a, low, high = 0.0, float(-sum(energies)), float(sum(slopes))
-        enough, left = self._curvature * abs(low), high / min(low, -TINY)
+        enough, left = self._curvature * abs(low), high / low if -low > sum(rounding) else 0.0
         if high <= max(enough, sum(rounding)):
             return b, left, remainders
         for _ in range(tol.max_line_search):  # regula falsi in Illinois' form
