@@ -158,6 +158,11 @@ class Regularisation:
         for share in self.shares:
             share.value = self.tolerances.share
 
+    def leave(self) -> None:
+        """Leave tangents as laws have them from here on, as where Newton's method has failed."""
+        for share in self.shares:
+            share.value = 0.0
+
     def follow(self, left: float, kept: bool) -> None:
         """Set the next share, where a step with a tangent of its own leaves so much."""
         most = self.tolerances.undershot

@@ -318,6 +318,7 @@ class NonlinearContactProblem(ContactProblem):
             / largest(self.decomposition.comm, d)
         )
         before = forms.residual()
+        self._regularisation.leave()
         along = forms.tangent() @ d
         self._set(u + h * d)
         apart = (forms.residual() - before) / h - along
