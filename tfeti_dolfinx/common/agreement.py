@@ -179,6 +179,7 @@ def _of_ufl(given: ufl.Form | Expr) -> dict[str, Any]:
         **{
             f"constants[{k}]": as_json(getattr(c, "value", type(c).__qualname__))
             for k, c in enumerate(constants)
+            if not hasattr(c, "law")  # which Newton's method sets
         },
         "functions": [str(f.ufl_element()) for f in functions],
     }

@@ -396,6 +396,7 @@ class J2Plasticity(Plasticity):
         self._gdim, elasticity, u = self.elasticity.mesh.geometry.dim, self.elasticity, self.u
         Q, W = self._space(), self._space((6 if self._gdim == 3 else 4,))
         self.share = fem.Constant(elasticity.mesh, 0.0)
+        self.share.law = self  # no part of what the user gives
         self.plastic_strain = fem.Function(W, name="plastic_strain")
         self.p = fem.Function(Q, name="accumulated_plastic_strain")
         self._dp = self._updated(Q, name="plastic_increment")  # of this load step
