@@ -92,7 +92,7 @@ class NewtonTolerances:
     anderson: int = 3
     dependent: float = 1e-12
     share: float = 0.1
-    undershot: float = 0.35
+    undershot: float = 0.3
     slow: float = 0.7
     difference: float = 1e-6
     another: float = 0.3
