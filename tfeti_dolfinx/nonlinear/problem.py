@@ -274,6 +274,7 @@ class NonlinearContactProblem(ContactProblem):
             kept = keeping.keeps(forms.kept, increment * most, t, tol.near * exact * most)
             # old places leave a body that is let go a moment, which drives it
             forms.kept = kept and not np.any(self._let_go)
+        self._regularisation.leave()
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
             f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
@@ -318,7 +319,6 @@ class NonlinearContactProblem(ContactProblem):
             / largest(self.decomposition.comm, d)
         )
         before = forms.residual()
-        self._regularisation.leave()
         along = forms.tangent() @ d
         self._set(u + h * d)
         apart = (forms.residual() - before) / h - along
@@ -429,7 +429,7 @@ class NonlinearContactProblem(ContactProblem):
     def _line_search(self, u: Array, d: Array) -> tuple[float, float, Array]:
         """Go to u + t d, and return t in (0, 1], r(1)/r(0), and |r(1)/r(0)| of bodies. Collective.
 
-        The last are of each body's part of d. Below 0 d goes too far.
+        The last are of each body's part of d. Where r(1)/r(0) is below 0, d goes too far.
         """
         tol, subdomains = self._tolerances, self._system.subdomains
         primal = subdomains.with_rigid(self.dofs.to_primal(d))
